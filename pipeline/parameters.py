@@ -1,0 +1,328 @@
+"""The typed configuration of the science stages, and the header of a raw archive.
+
+Every model is frozen and refuses unknown keys (the header keeps them, as its format demands). Values with a
+dimension are text with a unit outside and floats in SI units inside; see :mod:`coslidar.pipeline.units`.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from contextvars import ContextVar
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    field_validator,
+    model_validator,
+)
+from .geometry import Geometry, SliceGrid
+from .units import (
+    Angle,
+    Duration,
+    Electrons,
+    Frequency,
+    Gain,
+    Length,
+    Level,
+    PathLength,
+    Pixels,
+    Quantity,
+    QuantityError,
+    Wavelength,
+    parse,
+)
+
+#: Format of raw archives that this version reads and writes.
+FORMAT, FORMAT_VERSION = "shwfs-frames", 1
+#: Longest text in a header.
+MAX_TEXT = 1000
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+
+
+class Parameters(BaseModel):
+    """Frozen parameters that refuse unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, use_attribute_docstrings=True)
+
+
+class BatchParameters(Parameters):
+    """The averaging window of the science."""
+
+    duration: Duration = Field(default="3 min", gt=0)  # type: ignore[assignment]
+    """Length of a batch; an archive is cut into batches from its first frame on."""
+    minimum: float = Field(default=0.5, ge=0, le=1)
+    """A remainder at the end of an archive becomes a batch of its own if it is at least this fraction of
+    `duration`; shorter, it is left out. An archive shorter than one batch is one batch."""
+
+
+class ExtractionParameters(Parameters):
+    """How slopes and fluxes are measured on the frames."""
+
+    method: Literal["subpixel_window", "moving_maximum"] = "subpixel_window"
+    """`subpixel_window`: window with fractional edge weights re-centred on its own centroid;
+    `moving_maximum`: whole-pixel window centred on the brightest pixel (Sauvage et al. 2021, section 3.2)."""
+    window_x: Pixels | None = Field(default=None, gt=0)
+    """Width of the window along x; as large as box and sources allow where it is absent."""
+    window_y: Pixels | None = Field(default=None, gt=0)
+    """Height of the window along y; as large as the other source allows where it is absent."""
+    passes: int = Field(default=3, ge=1, le=20)
+    """How often the sub-pixel window is re-centred on its own centroid."""
+    search: Pixels = Field(default="4 pixel", ge=1)  # type: ignore[assignment]
+    """How far from its mean position a spot is looked for, along each axis."""
+    reference_frames: int = Field(default=256, ge=1)
+    """Frames at the start of a batch whose mean gives the fine position of the spots."""
+
+
+class CorrelationParameters(Parameters):
+    """How the noise of the correlation maps is estimated."""
+
+    covariance: Literal["lagged", "independent"] = "lagged"
+    """`lagged`: frames correlated in time, as they are; `independent`: as if no frame knew of the next
+    (Sauvage et al. 2021)."""
+
+
+class ResponseParameters(Parameters):
+    """The linear model that turns a Cn2 profile into correlation maps."""
+
+    slices: int = Field(default=12, ge=1, le=200)
+    """Number of equal slices between pupil and sources."""
+    sampling: Literal["mean", "midpoint"] = "mean"
+    """Response averaged over each slice, or taken at its mid-point."""
+    slope_response: Literal["centroid", "printed"] = "centroid"
+    """With the scintillation of the source's points in the centroid, or as printed in the paper."""
+    extent: Length | None = Field(default=None, gt=0)
+    """Where the slices end; required for sources at infinity, the path length where it is absent."""
+
+    def grid(self, geometry: Geometry) -> SliceGrid:
+        """Slices for a geometry.
+
+        Raises
+        ------
+        ValueError
+            The path is infinite and `extent` is absent, or `extent` lies beyond the sources.
+        """
+        end = self.extent if self.extent is not None else geometry.path_length
+        if math.isinf(end):
+            raise ValueError("response.extent is missing: the path is infinite; say where the slices end, '10 km'")
+        if end > geometry.path_length:
+            raise ValueError(f"response.extent = {end:g} m lies beyond the sources at {geometry.path_length:g} m")
+        return SliceGrid.uniform(end, self.slices)
+
+
+class InversionParameters(Parameters):
+    """Unpenalised unknowns that are estimated together with the profile."""
+
+    noise_bias: Literal["joint", "none"] = "joint"
+    """Detection noise on the zero separation of each auto-correlation map."""
+    slope_offset: Literal["joint", "none"] = "joint"
+    """One constant per slope axis: vibration, finite record, wind shake."""
+
+
+class Configuration(Parameters):
+    """Everything that changes a number, apart from the plugins."""
+
+    batch: BatchParameters = BatchParameters()
+    extraction: ExtractionParameters = ExtractionParameters()
+    correlation: CorrelationParameters = CorrelationParameters()
+    response: ResponseParameters = ResponseParameters()
+    inversion: InversionParameters = InversionParameters()
+
+
+# --- header of a raw archive -------------------------------------------------------------------------------
+
+_angular: ContextVar[bool] = ContextVar("_angular", default=False)
+
+
+class _SourceQuantity(Quantity):
+    """A length, or an angle where the path is infinite."""
+
+    def read(self, value: object) -> float:
+        return Quantity("rad" if _angular.get() else "m").read(value)
+
+    def note(self) -> str:
+        return " (path.length is infinite)" if _angular.get() else ""
+
+
+SourceLength = Annotated[float, _SourceQuantity("m")]
+
+
+def _name(value: str) -> str:
+    if not _NAME.fullmatch(value):
+        raise ValueError("use 1 to 100 letters, digits, '.', '_' and '-', beginning with a letter or digit")
+    return value
+
+
+Name = Annotated[str, AfterValidator(_name)]
+Text = Annotated[str, Field(max_length=MAX_TEXT)]
+Pixel = Annotated[float, Field(strict=False, allow_inf_nan=False)]
+
+
+class HeaderPart(BaseModel):
+    """Part of a header: frozen, unknown keys kept and handed on."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", use_attribute_docstrings=True)
+
+
+class Site(HeaderPart):
+    """Where the instrument stands."""
+
+    name: Text | None = None
+    latitude: Annotated[float, Quantity("deg")] | None = Field(default=None, ge=-90, le=90)
+    longitude: Annotated[float, Quantity("deg")] | None = Field(default=None, ge=-180, le=360)
+    timezone: Text | None = None
+
+    @field_validator("timezone")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        from zoneinfo import ZoneInfo
+
+        if value is not None:
+            try:
+                ZoneInfo(value)
+            except (ValueError, OSError, KeyError) as error:
+                raise ValueError("no such time zone; write for example 'Europe/Paris' or 'UTC'") from error
+        return value
+
+
+class Instrument(HeaderPart):
+    """Shack-Hartmann sensor and its detector."""
+
+    wavelength: Wavelength = Field(gt=0)
+    frame_rate: Frequency = Field(gt=0)
+    pixel_scale: Angle = Field(gt=0)
+    subaperture_size: Length = Field(gt=0)
+    subaperture_mask: tuple[tuple[Literal[0, 1], ...], ...]
+    lenslet_origin: tuple[int, int]
+    lenslet_pitch: tuple[int, int]
+    name: Text | None = None
+    exposure: Duration | None = Field(default=None, gt=0)
+    gain: Gain | None = Field(default=None, gt=0)
+    read_noise: Electrons | None = Field(default=None, ge=0)
+    saturation: Level | None = Field(default=None, gt=0)
+
+    @field_validator("subaperture_mask")
+    @classmethod
+    def _mask(cls, mask: tuple[tuple[int, ...], ...]) -> tuple[tuple[int, ...], ...]:
+        if not mask or not mask[0] or any(len(row) != len(mask[0]) for row in mask):
+            raise ValueError("the mask must be a rectangle of 0 and 1, one row of lenslets per line")
+        if len(mask) > 64 or len(mask[0]) > 64:
+            raise ValueError("at most 64 x 64 lenslets are supported")
+        if not any(any(row) for row in mask):
+            raise ValueError("no lenslet is exploited; write 1 for each that is")
+        return mask
+
+    @field_validator("lenslet_pitch")
+    @classmethod
+    def _pitch(cls, pitch: tuple[int, int]) -> tuple[int, int]:
+        if min(pitch) < 3:
+            raise ValueError("a lenslet box must be at least 3 pixels along each axis")
+        return pitch
+
+    @field_validator("lenslet_origin")
+    @classmethod
+    def _origin(cls, origin: tuple[int, int]) -> tuple[int, int]:
+        if min(origin) < 0:
+            raise ValueError("the first box must begin on the detector, at (row, col) of 0 or more")
+        return origin
+
+
+class Path(HeaderPart):
+    """Line of sight."""
+
+    length: PathLength = Field(gt=0)
+    height: Length | None = None
+
+
+class Source(HeaderPart):
+    """One source of light."""
+
+    name: Text
+    position: tuple[SourceLength, SourceLength]
+    """(x, y) in m, or as angles where the path is infinite."""
+    fwhm: tuple[Annotated[SourceLength, Field(ge=0)], Annotated[SourceLength, Field(ge=0)]]
+    """Full width at half maximum along x and y."""
+    spot: tuple[Pixel, Pixel]
+    """Nominal (row, col) of the spot in a lenslet box, in pixels."""
+
+
+class Header(HeaderPart):
+    """Attributes of a raw archive, format 1."""
+
+    format: Literal["shwfs-frames"]
+    format_version: Literal[1]
+    campaign: Name
+    archive: Name
+    instrument: Instrument
+    path: Path
+    sources: tuple[Source, ...]
+    site: Site | None = None
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _dimension_of_sources(cls, data: Any, handler: ModelWrapValidatorHandler[Header]) -> Header:
+        infinite = False
+        try:
+            infinite = math.isinf(parse(data["path"]["length"], "m", allow_infinite=True))
+        except (QuantityError, KeyError, TypeError, IndexError):
+            pass  # path.length has a fault of its own, reported by its field
+        token = _angular.set(infinite)
+        try:
+            return handler(data)
+        finally:
+            _angular.reset(token)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_texts(cls, data: Any) -> Any:
+        def walk(value: Any, key: str, depth: int) -> None:
+            if depth > 20:
+                raise ValueError(f"the header is nested too deeply at {key}")
+            if isinstance(value, str) and len(value) > MAX_TEXT:
+                raise ValueError(f"{key} holds {len(value)} characters; at most {MAX_TEXT} are allowed")
+            if isinstance(value, dict):
+                for name, item in value.items():
+                    walk(item, f"{key}.{name}" if key else str(name)[:MAX_TEXT], depth + 1)
+            elif isinstance(value, (list, tuple)):
+                for number, item in enumerate(value):
+                    walk(item, f"{key}[{number}]", depth + 1)
+
+        walk(data, "", 0)
+        return data
+
+    @field_validator("sources")
+    @classmethod
+    def _one_or_two(cls, sources: tuple[Source, ...]) -> tuple[Source, ...]:
+        if len(sources) not in (1, 2):
+            raise ValueError(f"there are {len(sources)} sources; list one or two")
+        if len(sources) == 2:
+            if sources[0].name == sources[1].name:
+                raise ValueError(f"both sources are called '{sources[0].name}'; give each a name of its own")
+            if sources[0].position == sources[1].position:
+                raise ValueError("both sources are at the same position; their separation is what profiles the path")
+        return sources
+
+    @model_validator(mode="after")
+    def _spots_in_boxes(self) -> Header:
+        rows, cols = self.instrument.lenslet_pitch
+        for number, source in enumerate(self.sources):
+            row, col = source.spot
+            if not (-0.5 <= row < rows - 0.5 and -0.5 <= col < cols - 0.5):
+                raise ValueError(
+                    f"sources[{number}].spot = [{row:g}, {col:g}] lies outside the lenslet box of {rows} x {cols} pixels"
+                )
+        return self
+
+    def geometry(self) -> Geometry:
+        """What the response functions need of this header."""
+        return Geometry(
+            mask=self.instrument.subaperture_mask,
+            subaperture_size=self.instrument.subaperture_size,
+            path_length=self.path.length,
+            wavelength=self.instrument.wavelength,
+            positions=tuple(source.position for source in self.sources),
+        )

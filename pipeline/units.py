@@ -1,0 +1,369 @@
+"""Quantities at the border: text with a unit outside, float64 in SI units inside.
+
+The only module that knows pint. Everything with a dimension enters as text ("3.8 um") and leaves as text;
+in between it is a plain float in the SI unit that its parameter declares.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import lru_cache
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import ValidationError
+from pydantic_core import PydanticCustomError, core_schema
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import pint
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+
+#: What a unit measures in words, and what to write, for the messages.
+_KNOWN: dict[str, tuple[str, tuple[str, ...]]] = {
+    "m": ("length", ("2670 m", "2.67 km")),
+    "rad": ("angle", ("27 urad", "1 arcsec")),
+    "s": ("duration", ("180 s", "3 min")),
+    "Hz": ("frequency", ("142 Hz", "1 kHz")),
+    "m/s": ("speed", ("3 m/s", "10 km/hour")),
+    "pixel": ("number of pixels", ("9 pixel", "10.5 pixel")),
+    "count": ("detector level", ("16383 count",)),
+    "electron": ("number of electrons", ("60 electron",)),
+    "electron/count": ("detector gain", ("12 electron/count",)),
+    "count/s": ("count rate", ("100 count/s",)),
+    "m^(4/3)": ("hyperparameter", ("1e27 m^(4/3)",)),
+    "m^(-2/3)": ("turbulence strength", ("1e-14 m^(-2/3)",)),
+    "m^(1/3)": ("integrated turbulence strength", ("1e-12 m^(1/3)",)),
+    "rad^2": ("angular variance", ("1e-12 rad^2",)),
+    "deg": ("angle", ("43.1285 deg",)),
+}
+
+
+#: pint holds angles and counts dimensionless, so that "5 count" would pass as an angle, and reads "px" as a
+#: length. Each of these lines of its definitions is replaced: every quantity here is a dimension of its own.
+_OWN_DEFINITIONS = {
+    "radian = [] = rad": "radian = [plane_angle] = rad",
+    "count = []": "count = [detector_level] = _ = ADU = adu",
+    "pixel = [printing_unit] = _ = dot = pel = picture_element": "pixel = [detector_position] = px",
+    "css_pixel = inch / 96 = px": "css_pixel = inch / 96",
+}
+
+
+@lru_cache(maxsize=1)
+def _registry() -> pint.UnitRegistry[Any]:
+    from importlib.resources import files
+
+    import pint
+
+    definitions = files("pint")
+    lines: list[str] = []
+    for line in (definitions / "default_en.txt").read_text("utf-8").splitlines():
+        if line.startswith("@import"):
+            lines += (definitions / line.split()[1]).read_text("utf-8").splitlines()
+        else:
+            lines.append(_OWN_DEFINITIONS.get(line.strip(), line))
+    registry: pint.UnitRegistry[Any] = pint.UnitRegistry(None)
+    registry.load_definitions([*lines, "electron = [electron_number]"])
+    return registry
+
+
+def _dimensionality(units: Any) -> dict[str, Fraction]:
+    # m^(1/3)/m has the exponent -0.6666666666666667 and m^(-2/3) has -0.6666666666666666: compare fractions.
+    return {
+        name: Fraction(float(power)).limit_denominator(60)
+        for name, power in dict(units.dimensionality).items()
+        if Fraction(float(power)).limit_denominator(60)
+    }
+
+
+@lru_cache(maxsize=256)
+def _describe(dimensionality: frozenset[tuple[str, Fraction]]) -> str:
+    for unit, (word, _) in _KNOWN.items():
+        if frozenset(_dimensionality(_registry().Unit(unit)).items()) == dimensionality:
+            return word
+    return "dimensionless number" if not dimensionality else "quantity of another kind"
+
+
+def rounded(value: float) -> float:
+    """Round to 15 significant digits, so that "3.8 um" and "3.8e-6 m" are the same number.
+
+    Parameters
+    ----------
+    value : float
+        Any float.
+
+    Returns
+    -------
+    float
+        The nearest float with 15 significant decimal digits; infinities unchanged.
+    """
+    return float(f"{value:.15g}")
+
+
+def text(value: float, unit: str) -> str:
+    """Write a value in SI units as text that :func:`parse` reads back to the same float.
+
+    Parameters
+    ----------
+    value : float
+        Value in `unit`.
+    unit : str
+        SI unit, in the spelling of the project (``"m^(-2/3)"``).
+
+    Returns
+    -------
+    str
+        For example ``"0.089 m"``.
+    """
+    return f"{rounded(value):.15g} {unit}"
+
+
+@dataclass(frozen=True)
+class QuantityError(ValueError):
+    """A quantity that cannot be read; the message says what was found and what was expected."""
+
+    reason: str
+
+    def __str__(self) -> str:
+        return self.reason
+
+
+_NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
+_COMMA = re.compile(r"^\s*([+-]?\d+),(\d+)(.*)$", re.DOTALL)
+_QUANTITY = re.compile(rf"^\s*({_NUMBER}|[+-]?(?:inf|infinity|nan))\s*(.*?)\s*$", re.IGNORECASE | re.DOTALL)
+
+
+def _article(word: str) -> str:
+    return ("an " if word[0] in "aeiou" else "a ") + word
+
+
+def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool = False) -> float:
+    """Read a quantity given as text.
+
+    Parameters
+    ----------
+    value : object
+        Text such as ``"2.67 km"``; anything else is an error that says so.
+    unit : str
+        The SI unit to convert to; its dimension is the one that is accepted.
+    key : str
+        Name of the parameter, for the message.
+    allow_infinite : bool
+        Whether ``"inf m"`` is legal (a path length only).
+
+    Returns
+    -------
+    float
+        Value in `unit`, rounded to 15 significant digits.
+
+    Raises
+    ------
+    QuantityError
+        The unit is missing, unknown or of another dimension, the number is not finite, or it is written
+        with a decimal comma.
+    """
+    word, examples = _KNOWN.get(unit, ("quantity", (f"1 {unit}",)))
+    sample = ", ".join(f"'{example}'" for example in examples)
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise QuantityError(f"a {type(value).__name__} is no quantity; {key} is {_article(word)}; write {sample}")
+    if not isinstance(value, str):
+        example = examples[0] if unit not in ("m", "s", "Hz") else f"{value:g} {unit}"
+        raise QuantityError(f"the unit is missing. {key} is {_article(word)}; write '{example}'")
+    if comma := _COMMA.match(value):
+        raise QuantityError(
+            f"use a point as decimal sign, not a comma; write '{comma[1]}.{comma[2]}{comma[3].rstrip()}'"
+        )
+    if len(value) > 200 or not (match := _QUANTITY.match(value)):
+        raise QuantityError(f"this is no number with a unit; {key} is {_article(word)}; write for example {sample}")
+    number, unit_text = float(match[1]), match[2]
+    if math.isnan(number) or (math.isinf(number) and not allow_infinite):
+        raise QuantityError(f"{key} must be a finite {word}, for example {sample}")
+    if not unit_text:
+        raise QuantityError(f"the unit is missing. {key} is {_article(word)}; write '{match[1]} {unit}'")
+    import pint
+
+    registry = _registry()
+    try:
+        # "^" and "(-2/3)" are pint's own grammar; a second number would be a product, never meant.
+        if re.match(rf"^\s*[*/]?\s*{_NUMBER}(?![\w)/])", unit_text):
+            raise QuantityError(f"this is no single number with a unit; {key} is {_article(word)}; write {sample}")
+        found = registry.Unit(unit_text)
+        wanted = registry.Unit(unit)
+    except QuantityError:
+        raise
+    except (pint.errors.PintError, ValueError, TypeError, AttributeError, KeyError, ZeroDivisionError, SyntaxError,
+            AssertionError, OverflowError, RecursionError) as error:
+        raise QuantityError(
+            f"'{unit_text}' is no unit that is known; {key} must be {_article(word)} (SI unit {unit}), "
+            f"for example {sample}"
+        ) from error
+    if _dimensionality(found) != _dimensionality(wanted):
+        what = _describe(frozenset(_dimensionality(found).items()))
+        raise QuantityError(
+            f"'{unit_text}' is {_article(what)}, but {key} must be {_article(word)} (SI unit {unit}), "
+            f"for example {sample}"
+        )
+    # The root factor of the unit alone: multiplying quantities would drag fractional exponents through pint.
+    factor = registry.get_root_units(found)[0] / registry.get_root_units(wanted)[0]
+    return rounded(number * float(factor))
+
+
+#: Stands for the key in a reason that is kept until the whole location of the value is known.
+_KEY = "\N{SYMBOL FOR NULL}"
+
+
+def quantity_fault(error: QuantityError, field: str | None, why: str = "") -> PydanticCustomError:
+    """Wrap a reason written with :data:`_KEY` for pydantic; :func:`faults` puts the full key in its place."""
+    shown = error.reason.replace(_KEY, field or "value") + why
+    return PydanticCustomError("quantity", "{shown}", {"shown": shown, "reason": error.reason + why})
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Annotation of a model field that is given as text with a unit and held as a float in SI units.
+
+    Parameters
+    ----------
+    unit : str
+        SI unit of the float.
+    infinite : bool
+        Whether ``"inf <unit>"`` is legal.
+    alternative : str or None
+        A second unit that is accepted (an angle, for sources at infinity).
+    """
+
+    unit: str
+    infinite: bool = False
+    alternative: str | None = None
+
+    def read(self, value: object) -> float:
+        """Read one value; raises :class:`QuantityError`."""
+        try:
+            return parse(value, self.unit, key=_KEY, allow_infinite=self.infinite)
+        except QuantityError:
+            if self.alternative is None:
+                raise
+            try:
+                return parse(value, self.alternative, key=_KEY)
+            except QuantityError:
+                pass
+            raise
+
+    def note(self) -> str:
+        """What to add to a fault."""
+        return ""
+
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        def read(value: object, info: core_schema.ValidationInfo) -> float:
+            try:
+                return self.read(value)
+            except QuantityError as error:
+                raise quantity_fault(error, info.field_name, self.note()) from error
+
+        def write(value: float) -> str:
+            return text(value, self.unit)
+
+        return core_schema.chain_schema(
+            [
+                core_schema.with_info_plain_validator_function(read),
+                core_schema.float_schema(allow_inf_nan=self.infinite),
+            ],
+            serialization=core_schema.plain_serializer_function_ser_schema(write, when_used="json"),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: core_schema.CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        return {"type": "string", "unit": self.unit, "examples": list(_KNOWN.get(self.unit, ("", ()))[1])}
+
+
+Length = Annotated[float, Quantity("m")]
+PathLength = Annotated[float, Quantity("m", infinite=True)]
+Extent = Annotated[float, Quantity("m", alternative="rad")]
+Angle = Annotated[float, Quantity("rad")]
+Wavelength = Annotated[float, Quantity("m")]
+Duration = Annotated[float, Quantity("s")]
+Frequency = Annotated[float, Quantity("Hz")]
+Speed = Annotated[float, Quantity("m/s")]
+Pixels = Annotated[float, Quantity("pixel")]
+Level = Annotated[float, Quantity("count")]
+Electrons = Annotated[float, Quantity("electron")]
+Gain = Annotated[float, Quantity("electron/count")]
+Hyperparameter = Annotated[float, Quantity("m^(4/3)")]
+TurbulenceStrength = Annotated[float, Quantity("m^(-2/3)")]
+AngularVariance = Annotated[float, Quantity("rad^2")]
+
+
+def _location(parts: Iterable[int | str]) -> str:
+    written = ""
+    for part in parts:
+        written += f"[{part}]" if isinstance(part, int) else f".{part}" if written else str(part)
+    return written
+
+
+def _found(value: object) -> str:
+    shown = repr(value)
+    return shown if len(shown) <= 120 else shown[:117] + "..."
+
+
+def safe(value: str) -> str:
+    """Make text from a file harmless on a terminal: control characters are escaped, long text is cut.
+
+    Parameters
+    ----------
+    value : str
+        Any text.
+
+    Returns
+    -------
+    str
+        Printable text of at most 500 characters.
+    """
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in value[:500])
+    return shown + ("…" if len(value) > 500 else "")
+
+
+def faults(error: ValidationError, origin: str, prefix: str = "") -> list[str]:
+    """Turn pydantic's faults into the project's sentences, one per fault.
+
+    Parameters
+    ----------
+    error : pydantic.ValidationError
+        What a model refused.
+    origin : str
+        File that the values come from.
+    prefix : str
+        Key of the model inside the file.
+
+    Returns
+    -------
+    list of str
+        ``"<origin>: <key> = <found>: <what is wrong and what to write>"``.
+    """
+    sentences = []
+    for fault in error.errors(include_url=False):
+        location = _location((*([prefix] if prefix else []), *fault["loc"]))
+        kind, context = fault["type"], fault.get("ctx", {})
+        message = fault["msg"]
+        if kind == "missing":
+            sentences.append(f"{origin}: {location} is missing; it is required")
+            continue
+        if kind == "extra_forbidden":
+            sentences.append(
+                f"{origin}: {location} = {_found(fault['input'])}: there is no such key; check its spelling"
+            )
+            continue
+        if kind == "quantity":
+            message = str(context["reason"]).replace(_KEY, location)
+        elif kind == "value_error":
+            message = str(context.get("error", message))
+        else:
+            message = message.replace("Input should", "it should")
+        if not location:
+            sentences.append(f"{origin}: {message}")
+        else:
+            sentences.append(f"{origin}: {location} = {_found(fault['input'])}: {message}")
+    return [safe(sentence) for sentence in sentences]
