@@ -38,3 +38,126 @@ class Measurements:
             np.concatenate([part.flux for part in parts]),
             np.concatenate([part.flag for part in parts]),
         )
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One variable of a product.
+
+    Parameters
+    ----------
+    name : str
+        Name in the file.
+    dims : tuple of str
+        Dimensions; `time` first where the variable changes from batch to batch.
+    unit : str
+        SI unit; ``"1"`` without dimension.
+    dtype : str
+        numpy dtype.
+    long_name : str
+        What it is.
+    """
+
+    name: str
+    dims: tuple[str, ...]
+    unit: str
+    dtype: str
+    long_name: str
+
+
+def _schema(*rows: tuple[str, str, str, str, str]) -> dict[str, Variable]:
+    return {
+        name: Variable(name, tuple(dims.split()), unit, dtype, long_name)
+        for name, dims, unit, dtype, long_name in rows
+    }
+
+
+#: Slope kinds and intensity kinds, in the order of :data:`coslidar.pipeline.geometry.MAP_KINDS`.
+SLOPE_KINDS = ("xx_auto", "yy_auto", "xx_cross", "yy_cross")
+INTENSITY_KINDS = ("ii_auto", "ii_cross")
+
+#: Coordinates of a product.
+COORDINATES = _schema(
+    ("time", "time", "ns", "int64", "start of the batch, UTC, nanoseconds since 1970-01-01T00:00:00"),
+    ("z", "z", "m", "float64", "distance of the slice's mid-point from the pupil"),
+    ("z_true", "z_true", "m", "float64", "distance of the slice that an averaging kernel looks at"),
+    ("dy", "dy", "m", "float64", "separation of the subapertures along y, first minus second"),
+    ("dx", "dx", "m", "float64", "separation of the subapertures along x, first minus second"),
+    ("log_mu_grid", "log_mu_grid", "1", "float64", "log10 of the hyperparameter mu in m^(4/3)"),
+)
+
+#: Every other variable of a product, schema version 1.
+SCHEMA = _schema(
+    ("time_bounds", "time bound", "ns", "int64", "start and end of the batch"),
+    ("z_bounds", "z bound", "m", "float64", "borders of the slices"),
+    ("cn2", "time z", "m^(-2/3)", "float64", "refractive index structure parameter Cn2"),
+    ("cn2_standard_error", "time z", "m^(-2/3)", "float64", "MAP error bar of Cn2"),
+    ("cn2_standard_error_ml", "time z", "m^(-2/3)", "float64", "maximum-likelihood error bar of Cn2"),
+    ("cn2_at_bound", "time z", "1", "uint8", "1 where the positivity constraint is active"),
+    ("averaging_kernel", "time z z_true", "1", "float64", "response of the retrieved to the true profile"),
+    ("degrees_of_freedom", "time", "1", "float64", "degrees of freedom for signal"),
+    ("mu", "time", "m^(4/3)", "float64", "regularisation hyperparameter"),
+    ("criterion", "time log_mu_grid", "1", "float64", "criterion curve that mu was chosen from"),
+    ("slope_correlation", "time slope_kind dy dx", "rad^2", "float64", "measured slope correlation maps"),
+    ("slope_correlation_model", "time slope_kind dy dx", "rad^2", "float64", "slope maps of the profile"),
+    ("slope_correlation_error", "time slope_kind dy dx", "rad^2", "float64", "convergence noise, 1 sigma"),
+    ("intensity_correlation", "time intensity_kind dy dx", "1", "float64", "measured scintillation maps"),
+    ("intensity_correlation_model", "time intensity_kind dy dx", "1", "float64", "scintillation maps of the profile"),
+    ("intensity_correlation_error", "time intensity_kind dy dx", "1", "float64", "convergence noise, 1 sigma"),
+    ("pair_count", "dy dx", "1", "int64", "pairs of subapertures of a separation"),
+    ("r0_profile", "time", "m", "float64", "Fried parameter of a spherical wave, from the profile"),
+    ("scintillation_index_direct", "time source", "1", "float64", "variance of the relative flux, noise removed"),
+    ("scintillation_index_profile", "time", "1", "float64", "aperture- and source-averaged index of the profile"),
+    ("scintillation_index_point", "time", "1", "float64", "index of one point of the source, from the profile"),
+    ("mean_flux", "time source", "count", "float64", "mean flux of a spot"),
+    ("noise_variance_slope", "time axis", "rad^2", "float64", "detection noise of the slopes, joint estimate"),
+    ("noise_variance_intensity", "time", "1", "float64", "detection noise of the relative flux, joint estimate"),
+    ("slope_offset", "time axis", "rad^2", "float64", "constant of the slope maps, joint estimate"),
+    ("n_frames", "time", "1", "int64", "frames in the batch"),
+    ("n_effective", "time axis_kind", "1", "float64", "effectively independent frames for x, y slopes and flux"),
+    ("valid_fraction", "time source", "1", "float64", "fraction of slopes and fluxes that could be measured"),
+    ("chi2_reduced", "time", "1", "float64", "misfit per independent datum"),
+    ("quality_flag", "time", "1", "int32", "quality flags"),
+    ("quality_level", "time", "1", "int8", "0 good, 1 usable with care, 2 bad"),
+)
+
+#: Bits of `quality_flag`: name -> (bit, level it sets, meaning).
+QUALITY_FLAGS: dict[str, tuple[int, int, str]] = {
+    "failed": (1, 2, "the batch could not be processed; its variables are NaN"),
+    "short": (2, 1, "less than half of the requested batch length"),
+    "gaps": (4, 1, "more than 1 % of the frames are missing"),
+    "lost_spots": (8, 1, "more than 1 % of the spots could not be measured"),
+    "saturated": (16, 1, "more than 1 % of the spots hold a saturated pixel"),
+    "mu_at_edge": (32, 1, "the criterion has its minimum at the edge of the range of mu"),
+    "negative_noise": (64, 1, "a joint noise variance is negative by more than three of its errors"),
+    "poor_fit": (128, 1, "chi2 per datum above 3"),
+    "strong_scintillation": (256, 1, "index of one point of the source above 0.3: first-order theory fails"),
+}
+
+
+@dataclass(frozen=True)
+class BatchResult:
+    """Everything one batch contributes to a product.
+
+    Parameters
+    ----------
+    start, stop : int
+        Time bounds, ns since 1970-01-01T00:00:00 UTC.
+    values : dict of str to ndarray
+        Variables of :data:`SCHEMA` without their time dimension.
+    quality_flag : int
+        Bits of :data:`QUALITY_FLAGS`.
+    reason : str
+        Why the batch failed; empty where it did not.
+    """
+
+    start: int
+    stop: int
+    values: dict[str, NDArray[np.generic]]
+    quality_flag: int = 0
+    reason: str = ""
+
+    @property
+    def quality_level(self) -> int:
+        """0 good, 1 usable with care, 2 bad."""
+        return max([0, *(level for bit, level, _ in QUALITY_FLAGS.values() if self.quality_flag & bit)])

@@ -168,7 +168,9 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
     word, examples = _KNOWN.get(unit, ("quantity", (f"1 {unit}",)))
     sample = ", ".join(f"'{example}'" for example in examples)
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise QuantityError(f"a {type(value).__name__} is no quantity; {key} is {_article(word)}; write {sample}")
+        raise QuantityError(
+            f"a {type(value).__name__} is no quantity; {key} is {_article(word)}; write {sample}"
+        )
     if not isinstance(value, str):
         example = examples[0] if unit not in ("m", "s", "Hz") else f"{value:g} {unit}"
         raise QuantityError(f"the unit is missing. {key} is {_article(word)}; write '{example}'")
@@ -177,7 +179,9 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
             f"use a point as decimal sign, not a comma; write '{comma[1]}.{comma[2]}{comma[3].rstrip()}'"
         )
     if len(value) > 200 or not (match := _QUANTITY.match(value)):
-        raise QuantityError(f"this is no number with a unit; {key} is {_article(word)}; write for example {sample}")
+        raise QuantityError(
+            f"this is no number with a unit; {key} is {_article(word)}; write for example {sample}"
+        )
     number, unit_text = float(match[1]), match[2]
     if math.isnan(number) or (math.isinf(number) and not allow_infinite):
         raise QuantityError(f"{key} must be a finite {word}, for example {sample}")
@@ -189,13 +193,25 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
     try:
         # "^" and "(-2/3)" are pint's own grammar; a second number would be a product, never meant.
         if re.match(rf"^\s*[*/]?\s*{_NUMBER}(?![\w)/])", unit_text):
-            raise QuantityError(f"this is no single number with a unit; {key} is {_article(word)}; write {sample}")
+            raise QuantityError(
+                f"this is no single number with a unit; {key} is {_article(word)}; write {sample}"
+            )
         found = registry.Unit(unit_text)
         wanted = registry.Unit(unit)
     except QuantityError:
         raise
-    except (pint.errors.PintError, ValueError, TypeError, AttributeError, KeyError, ZeroDivisionError, SyntaxError,
-            AssertionError, OverflowError, RecursionError) as error:
+    except (
+        pint.errors.PintError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        ZeroDivisionError,
+        SyntaxError,
+        AssertionError,
+        OverflowError,
+        RecursionError,
+    ) as error:
         raise QuantityError(
             f"'{unit_text}' is no unit that is known; {key} must be {_article(word)} (SI unit {unit}), "
             f"for example {sample}"
@@ -256,7 +272,9 @@ class Quantity:
         """What to add to a fault."""
         return ""
 
-    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
         def read(value: object, info: core_schema.ValidationInfo) -> float:
             try:
                 return self.read(value)
