@@ -1,1 +1,1 @@
-
+"""Orchestration: plans, Dask, Prefect, and the command line."""

@@ -1,1 +1,1 @@
-
+"""The science: pure functions of arrays and one typed configuration."""

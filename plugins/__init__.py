@@ -1,1 +1,1 @@
-
+"""Plugins: contract, registry and the built-in ones."""

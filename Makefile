@@ -1,0 +1,74 @@
+# make demo   from nothing to a profile and a picture
+# make test   from nothing to a passed test suite
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+PIP    := $(BIN)/python -m pip --disable-pip-version-check
+export OMP_NUM_THREADS ?= 1
+export OPENBLAS_NUM_THREADS ?= 1
+
+.PHONY: help demo test test-all bench bench-chain lint dev constraints clean
+
+help:
+	@echo "make demo      install, simulate a small recording, profile it, draw a report"
+	@echo "make test      install and run the test suite"
+	@echo "make test-all  the same with the slow science checks"
+	@echo "make bench     every benchmark, as ratios;  make bench-chain: chain against reading"
+	@echo "make lint      ruff and mypy;  make dev: what an editor needs"
+
+$(VENV)/.python:
+	@command -v $(PYTHON) >/dev/null || { echo "make: no $(PYTHON) on this machine; install Python 3.11 or later," \
+	  "or name it: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "make: $$($(PYTHON) --version) is too old;" \
+	  "coslidar needs Python 3.11 or later: make PYTHON=/path/to/python3 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "make: $(PYTHON) cannot make a virtual environment; on Debian and" \
+	  "Ubuntu: apt install python3-venv"; exit 1; }
+	@touch $@
+
+$(VENV)/.core: $(VENV)/.python pyproject.toml constraints.txt
+	@echo "installing coslidar into $(VENV) (about a minute) ..."
+	@$(PIP) install -q -c constraints.txt -e . || { echo "make: the installation failed; pip needs a package index" \
+	  "(PyPI or a mirror) to reach"; exit 1; }
+	@touch $@
+
+$(VENV)/.test: $(VENV)/.core
+	@echo "installing the test tools ..."
+	@$(PIP) install -q -c constraints.txt -e ".[test,dev]" || { echo "make: the installation failed; pip needs a package" \
+	  "index (PyPI or a mirror) to reach"; exit 1; }
+	@touch $@
+
+demo: $(VENV)/.core
+	@$(BIN)/coslidar init demo --scenario demo
+	@$(BIN)/coslidar run demo/campaign.toml
+	@$(BIN)/coslidar report demo/campaign.toml -o demo/report.html
+	@echo
+	@echo "Next:  open demo/report.html in a browser"
+	@echo "       $(BIN)/coslidar catalog ls --out demo/results     what has been computed"
+	@echo "       $(BIN)/coslidar init my-campaign                  a campaign file for your own recordings"
+
+test: $(VENV)/.test
+	@$(BIN)/python -m pytest -q -m "not slow" $(PYTEST_ARGS)
+	@echo "All tests passed.  Next: make demo, or make test-all for the slow science checks."
+
+test-all: $(VENV)/.test
+	@$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+
+bench: $(VENV)/.test
+	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
+
+bench-chain: $(VENV)/.test
+	@$(BIN)/python benchmarks/bench_chain.py
+
+lint: dev
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy -p coslidar.pipeline -p coslidar.plugins -p coslidar.catalog -p coslidar.flows
+
+dev: $(VENV)/.test
+	@mkdir -p .dev && ln -sfn .. .dev/coslidar
+
+constraints: $(VENV)/.test
+	@{ sed -n '/^#/p' constraints.txt; $(PIP) freeze --exclude-editable; } > constraints.new && mv constraints.new constraints.txt
+
+clean:
+	rm -rf $(VENV) .dev demo bench-data build *.egg-info

@@ -1,0 +1,114 @@
+"""The command line. Every command imports what it needs when it runs, so that `--help` is instant."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+#: Command -> (module with it, line for the list of commands), in the order of use.
+COMMANDS = {
+    "init": ("start", "Write a campaign file to begin with, or a whole simulated example."),
+    "inspect": ("start", "Show what a raw archive holds, and every fault it has."),
+    "simulate": ("start", "Make recordings whose truth is known."),
+    "plan": ("process", "Show what a run would read, compute and reuse."),
+    "run": ("process", "Turn recordings into catalogued Cn2 profiles."),
+    "report": ("results", "Draw one self-contained page of a campaign or product."),
+    "catalog": ("results", "List, show, export and check products."),
+    "plugins": ("science", "List and describe installed plugins."),
+    "response": ("science", "Compute the response matrix M of an instrument."),
+    "invert": ("science", "Invert correlation data of your own with a response matrix."),
+}
+
+
+class Commands(click.Group):
+    """Commands that are imported only when they are called."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """In the order of use."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import one command."""
+        if cmd_name not in COMMANDS:
+            return None
+        module = importlib.import_module(f".commands.{COMMANDS[cmd_name][0]}", __package__)
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands without importing any."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
+
+
+@click.group(
+    cls=Commands,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="First steps:  coslidar init demo --scenario demo;  coslidar run demo/campaign.toml;  "
+    "coslidar report demo/campaign.toml -o report.html",
+)
+@click.version_option(package_name="coslidar")
+def cli() -> None:
+    """Cn2 profiles along the line of sight from Shack-Hartmann recordings of two distant sources.
+
+    Raw archives (zarr, format 1) go in; catalogued profiles with error bars, units and lineage come out.
+    Quantities are written with their unit: "7 cm", "3 min", "1e27 m^(4/3)".
+
+    Exit codes: 0 all done, 1 something failed, 2 an input cannot be used, 130 interrupted.
+    """
+
+
+def complain(faults: Sequence[str]) -> None:
+    """Print one line per fault on stderr."""
+    for fault in faults:
+        click.echo(f"coslidar: {fault}", err=True)
+
+
+def _stop(signum: int, frame: Any) -> NoReturn:
+    raise KeyboardInterrupt
+
+
+def main() -> None:
+    """Run the command line; no traceback reaches the user unless COSLIDAR_DEBUG is set."""
+    from .cluster import limit_threads
+
+    limit_threads()
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        sys.exit(cli.main(standalone_mode=False) or 0)
+    except click.exceptions.Exit as leave:
+        sys.exit(leave.exit_code)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except (KeyboardInterrupt, click.Abort):
+        complain(["interrupted; what was finished is kept, the same command goes on from there"])
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output (head, less) has gone; that is its good right.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+    except Exception as error:
+        faults = getattr(error, "faults", None)
+        if isinstance(faults, list):
+            complain(faults)
+            sys.exit(2)
+        if os.environ.get("COSLIDAR_DEBUG"):
+            raise
+        from ..pipeline.units import safe
+
+        complain(
+            [
+                f"{type(error).__name__}: {safe(str(error))}",
+                "this is not your input's fault, or we failed to say so; COSLIDAR_DEBUG=1 shows where it happened",
+            ]
+        )
+        sys.exit(1)

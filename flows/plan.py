@@ -1,0 +1,237 @@
+"""What a run would do: batches, keys, and what is already there. Imports neither Dask nor Prefect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..catalog.archive import open_archive
+from ..pipeline import batch as stages
+from ..pipeline import response
+from ..pipeline.lineage import Key, document, make_key
+from ..pipeline.units import safe
+from .settings import InputError
+
+if TYPE_CHECKING:
+    from ..catalog.archive import Archive
+    from ..pipeline.geometry import Geometry, SliceGrid
+    from ..pipeline.parameters import BatchParameters, Header
+    from ..plugins.contract import (
+        HyperparameterSelectorBase,
+        RegulariserBase,
+        SourceModelBase,
+        TurbulenceSpectrumBase,
+    )
+    from .settings import Settings
+
+
+@dataclass(frozen=True)
+class BatchWindow:
+    """Frames of one batch.
+
+    Parameters
+    ----------
+    index : int
+        Number of the batch in its archive.
+    start, stop : int
+        First frame and one past the last.
+    start_time, stop_time : int
+        Time stamp of the first frame, and of the last plus one frame period; ns since 1970 UTC.
+    """
+
+    index: int
+    start: int
+    stop: int
+    start_time: int
+    stop_time: int
+
+
+@dataclass(frozen=True, eq=False)
+class ArchivePlan:
+    """Everything that is needed to process one archive under one setting.
+
+    Parameters
+    ----------
+    url : str
+        Where the archive is.
+    archive : Archive
+        The open archive.
+    header : Header
+        Its header with the campaign's tables on top.
+    geometry : Geometry
+        From the header.
+    grid : SliceGrid
+        Slices of the profile.
+    sources, spectrum, regulariser, selector
+        Plugins.
+    windows : tuple of BatchWindow
+        Batches.
+    reduction_key, response_key, profile_key : Key
+        Identity of the correlations, of the response matrix, and of the product.
+    """
+
+    url: str
+    archive: Archive
+    header: Header
+    geometry: Geometry
+    grid: SliceGrid
+    sources: tuple[SourceModelBase, ...]
+    spectrum: TurbulenceSpectrumBase
+    regulariser: RegulariserBase
+    selector: HyperparameterSelectorBase
+    windows: tuple[BatchWindow, ...]
+    reduction_key: Key
+    response_key: Key
+    profile_key: Key
+
+    @property
+    def name(self) -> str:
+        """Campaign and archive, for people."""
+        return f"{self.header.campaign}/{self.header.archive}"
+
+    def lineage(self) -> dict[str, Any]:
+        """The keys of the product with everything that they were made of."""
+        return document(self.profile_key)
+
+
+def batch_windows(time: np.ndarray[Any, np.dtype[np.int64]], rate: float, batch: BatchParameters) -> list[BatchWindow]:
+    """Cut a recording into batches.
+
+    Batches begin at the first frame and follow each other without overlap; a gap in the recording does not shift
+    them. A remainder shorter than `minimum` of a batch is left out, unless it is all there is.
+
+    Parameters
+    ----------
+    time : ndarray of int64, (T,)
+        Time stamps, ns.
+    rate : float
+        Frame rate, Hz.
+    batch : BatchParameters
+        Length of a batch.
+
+    Returns
+    -------
+    list of BatchWindow
+    """
+    period = round(1e9 / rate)
+    length = round(batch.duration * 1e9)
+    first = int(time[0])
+    end = int(time[-1]) + period
+    count = max(1, -(-(end - first) // length))
+    windows: list[BatchWindow] = []
+    for number in range(count):
+        # Half a period of slack: a time stamp that jitters around an edge belongs to the batch it begins.
+        low, high = (int(np.searchsorted(time, first + edge * length - period // 2)) for edge in (number, number + 1))
+        if number == count - 1:
+            high = len(time)
+            if count > 1 and end - (first + number * length) < batch.minimum * length:
+                break
+        if high > low:
+            windows.append(BatchWindow(len(windows), low, high, int(time[low]), int(time[high - 1]) + period))
+    return windows
+
+
+def plan_archive(url: str, settings: Settings) -> ArchivePlan:
+    """Open an archive and work out its batches and keys.
+
+    Parameters
+    ----------
+    url : str
+        Path or URL.
+    settings : Settings
+        What to compute.
+
+    Returns
+    -------
+    ArchivePlan
+
+    Raises
+    ------
+    coslidar.catalog.archive.ArchiveError
+        The archive is not sound.
+    InputError
+        Archive and settings do not fit each other.
+    """
+    archive = open_archive(url, overlay=settings.header) if settings.header else open_archive(url)
+    header = archive.header
+    origin = safe(url)
+    if settings.campaign is not None and header.campaign != settings.campaign:
+        raise InputError(
+            [
+                f"{origin}: campaign = '{header.campaign}': {settings.origin} is about campaign "
+                f"'{settings.campaign}'; leave this archive out, or process it under a campaign file of its own"
+            ]
+        )
+    geometry = header.geometry()
+    configuration = settings.configuration
+    try:
+        grid = configuration.response.grid(geometry)
+    except ValueError as error:
+        raise InputError([f"{settings.origin}: {error}"]) from error
+    sources = settings.source_models(header, origin)
+    spectrum, regulariser, selector = settings.spectrum(), settings.regulariser(), settings.selector()
+
+    instrument = header.instrument
+    measured = make_key(
+        "measurements",
+        stages.MEASURE_VERSION,
+        tracked={
+            "archive": archive.identity,
+            "extraction": configuration.extraction.model_dump(),
+            "batch": configuration.batch.model_dump(),
+            "detector": {
+                "pixel_scale": instrument.pixel_scale,
+                "frame_rate": instrument.frame_rate,
+                "saturation": instrument.saturation,
+                "mask": instrument.subaperture_mask,
+                "origin": instrument.lenslet_origin,
+                "pitch": instrument.lenslet_pitch,
+                "spots": [source.spot for source in header.sources],
+            },
+        },
+    )
+    reduction = make_key(
+        "correlation",
+        stages.REDUCE_VERSION,
+        tracked=configuration.correlation.model_dump(),
+        upstream=[measured],
+    )
+    responses = make_key(
+        "response",
+        response.VERSION,
+        tracked={
+            "sampling": configuration.response.sampling,
+            "slope_response": configuration.response.slope_response,
+            "edges": grid.edges,
+            "mask": geometry.mask,
+            "subaperture_size": geometry.subaperture_size,
+            "path_length": geometry.path_length,
+            "wavelength": geometry.wavelength,
+            "positions": geometry.positions,
+        },
+        plugins=[*(source.identity() for source in sources), spectrum.identity()],
+    )
+    profile = make_key(
+        "profile",
+        stages.RETRIEVE_VERSION,
+        tracked=configuration.inversion.model_dump(),
+        plugins=[regulariser.identity(), selector.identity()],
+        upstream=[reduction, responses],
+    )
+    return ArchivePlan(
+        url=url,
+        archive=archive,
+        header=header,
+        geometry=geometry,
+        grid=grid,
+        sources=sources,
+        spectrum=spectrum,
+        regulariser=regulariser,
+        selector=selector,
+        windows=tuple(batch_windows(archive.time, instrument.frame_rate, configuration.batch)),
+        reduction_key=reduction,
+        response_key=responses,
+        profile_key=profile,
+    )

@@ -1,0 +1,338 @@
+"""One batch from frames to a profile: the only place where the stages meet.
+
+Three steps, each a pure function, each with a version that enters the keys of what it makes: `measure` (frames to
+slopes and fluxes), `reduce` (to correlation maps and their noise), `retrieve` (to a profile).
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import convergence, correlation, extraction, inversion, noise, turbulence
+from .geometry import MAP_KINDS
+from .products import INTENSITY_KINDS, QUALITY_FLAGS, SLOPE_KINDS, BatchResult, Measurements
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from numpy.typing import NDArray
+
+    from .geometry import Geometry, SliceGrid
+    from .parameters import (
+        CorrelationParameters,
+        ExtractionParameters,
+        Header,
+        InversionParameters,
+    )
+    from .protocols import HyperparameterSelector, Regulariser
+
+#: Raise it whenever the same input gives other numbers.
+MEASURE_VERSION = extraction.VERSION
+REDUCE_VERSION = 1
+RETRIEVE_VERSION = 1
+
+#: Fewer frames than this make no correlation worth the name.
+MIN_FRAMES = 64
+#: A step of the time stamps longer than this many frame periods is a gap.
+GAP = 1.5
+
+
+class BatchError(ValueError):
+    """A batch that cannot be processed, with the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReducedBatch:
+    """What remains of a batch once its frames have been read.
+
+    Parameters
+    ----------
+    start, stop : int
+        First and last time stamp, plus one frame period; ns since 1970-01-01T00:00:00 UTC.
+    quality_flag : int
+        Bits of :data:`coslidar.pipeline.products.QUALITY_FLAGS` known so far.
+    arrays : dict of str to ndarray
+        `maps` (6, 2p - 1, 2q - 1), `noise_covariance` (m, m), `n_effective` (3,), `mean_flux` (S,),
+        `scintillation_index` (S,), `valid_fraction` (S,), `n_frames`.
+    """
+
+    start: int
+    stop: int
+    quality_flag: int
+    arrays: dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """What turns reduced data into a profile; the same for all batches of an archive.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        Pupil, path and sources.
+    grid : SliceGrid
+        Slices of the profile.
+    matrix : ndarray, (n, k)
+        Response matrix M, slice thickness included.
+    regulariser, selector
+        Plugins.
+    inversion : InversionParameters
+        Unpenalised unknowns.
+    """
+
+    geometry: Geometry
+    grid: SliceGrid
+    matrix: NDArray[np.float64]
+    regulariser: Regulariser
+    selector: HyperparameterSelector
+    inversion: InversionParameters
+
+
+def measure(
+    blocks: Iterable[NDArray[Any]],
+    time: NDArray[np.int64],
+    header: Header,
+    calibration: extraction.Calibration,
+    parameters: ExtractionParameters,
+) -> Measurements:
+    """Slopes and fluxes of the frames of one batch, block by block.
+
+    Parameters
+    ----------
+    blocks : iterable of ndarray, (n, row, col)
+        Consecutive raw frames; how they are cut does not matter.
+    time : ndarray of int64, (T,)
+        Time stamps of all of them.
+    header : Header
+        Header of the archive.
+    calibration : Calibration
+        Dark, flat, bad pixels.
+    parameters : ExtractionParameters
+        Method and window.
+
+    Returns
+    -------
+    Measurements
+
+    Raises
+    ------
+    BatchError
+        The mean frame shows no spots that can be measured.
+    """
+    waiting: list[NDArray[Any]] = []
+    count = 0
+    layout: extraction.SpotLayout | None = None
+    parts: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
+
+    def begin() -> extraction.SpotLayout:
+        head = np.concatenate(waiting)
+        mean = extraction.reference_image(head[: parameters.reference_frames])
+        try:
+            found = extraction.layout(header, mean, calibration, parameters)
+        except ValueError as error:
+            raise BatchError(str(error)) from error
+        parts.append(extraction.extract(head, found, calibration, parameters))
+        return found
+
+    for block in blocks:
+        if layout is not None:
+            parts.append(extraction.extract(block, layout, calibration, parameters))
+            continue
+        waiting.append(block)
+        count += len(block)
+        if count >= parameters.reference_frames:
+            layout = begin()
+            waiting.clear()
+    if layout is None:
+        if not waiting:
+            raise BatchError("there is no frame")
+        begin()
+    slopes, flux, flag = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return Measurements(time, slopes, flux, flag)
+
+
+def reduce(
+    measurements: Measurements,
+    geometry: Geometry,
+    frame_rate: float,
+    duration: float,
+    parameters: CorrelationParameters,
+) -> ReducedBatch:
+    """Correlation maps of a batch and their noise.
+
+    Parameters
+    ----------
+    measurements : Measurements
+        Slopes and fluxes.
+    geometry : Geometry
+        Pupil and sources.
+    frame_rate : float
+        Hz.
+    duration : float
+        Requested length of a batch, s.
+    parameters : CorrelationParameters
+        How the noise is estimated.
+
+    Returns
+    -------
+    ReducedBatch
+
+    Raises
+    ------
+    BatchError
+        There are too few frames, or a source is not seen.
+    """
+    frames = len(measurements.time)
+    if frames < MIN_FRAMES:
+        raise BatchError(f"{frames} frames are too few for correlations; at least {MIN_FRAMES} are needed")
+    slopes, flux, flag = measurements.slopes, measurements.flux, measurements.flag
+    seen = np.isfinite(flux)
+    valid = seen.mean(axis=(0, 2))
+    for number, fraction in enumerate(valid):
+        if not seen[:, number].any(axis=0).all() or fraction < 0.5:
+            lost = int((~seen[:, number].any(axis=0)).sum())
+            raise BatchError(
+                f"source {number + 1} could be measured in {fraction:.1%} of its spots "
+                f"({lost} of {flux.shape[2]} subapertures never); at least half of each is needed"
+            )
+    found = correlation.finalise(correlation.accumulate(slopes, flux), geometry)
+    if parameters.covariance == "lagged":
+        lagged = convergence.lagged(slopes, flux, geometry)
+        covariance, n_effective = lagged.covariance, lagged.n_effective
+    else:
+        covariance = convergence.independent(found.covariance, frames, geometry, found.valid_fraction)
+        n_effective = np.full(3, float(frames))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        detection = np.nanmean(noise.white_noise_variance(flux) / found.mean_flux**2, axis=1)
+
+    period = round(1e9 / frame_rate)
+    steps = np.diff(measurements.time)
+    missing = int(np.round(steps[steps > GAP * period] / period - 1).sum())
+    quality = 0
+    span = (int(measurements.time[-1]) - int(measurements.time[0]) + period) / 1e9
+    for name, applies in (
+        ("short", span < 0.5 * duration),
+        ("gaps", missing > 0.01 * frames),
+        ("lost_spots", float(seen.mean()) < 0.99),
+        ("saturated", float(((flag & extraction.FLAGS["saturated"]) > 0).mean()) > 0.01),
+    ):
+        quality |= QUALITY_FLAGS[name][0] * bool(applies)
+    return ReducedBatch(
+        start=int(measurements.time[0]),
+        stop=int(measurements.time[-1]) + period,
+        quality_flag=quality,
+        arrays={
+            "maps": found.maps,
+            "noise_covariance": covariance,
+            "n_effective": n_effective,
+            "mean_flux": found.mean_flux.mean(axis=1),
+            "scintillation_index": found.scintillation_index - detection,
+            "valid_fraction": valid,
+            "n_frames": np.asarray(frames),
+        },
+    )
+
+
+def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
+    """Profile of a batch, its uncertainty, and what follows from it.
+
+    Parameters
+    ----------
+    reduced : ReducedBatch
+        Result of :func:`reduce`.
+    model : Model
+        Response and plugins.
+
+    Returns
+    -------
+    BatchResult
+
+    Raises
+    ------
+    BatchError
+        The data admit no inversion.
+    """
+    geometry, grid, arrays = model.geometry, model.grid, reduced.arrays
+    data = correlation.data_vector(arrays["maps"])
+    try:
+        profile = inversion.invert(
+            data,
+            arrays["noise_covariance"],
+            model.matrix,
+            grid=grid,
+            regulariser=model.regulariser,
+            selector=model.selector,
+            rows=geometry.independent,
+            noise_bias=model.inversion.noise_bias == "joint",
+            slope_offset=model.inversion.slope_offset == "joint",
+        )
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise BatchError(f"the inversion failed: {error}") from error
+
+    shape = (len(MAP_KINDS), *geometry.map_shape)
+    fitted = profile.model.reshape(shape)
+    deviation = convergence.deviation_maps(arrays["noise_covariance"], geometry)
+    slope = [MAP_KINDS.index(kind) for kind in SLOPE_KINDS]
+    intensity = [MAP_KINDS.index(kind) for kind in INTENSITY_KINDS]
+    unknown = dict(zip(profile.nuisance_names, zip(profile.nuisance, profile.nuisance_error, strict=True), strict=True))
+
+    def joint(*names: str) -> NDArray[np.float64]:
+        return np.array([unknown.get(name, (np.nan, np.nan))[0] for name in names])
+
+    point = turbulence.point_scintillation_index(profile.cn2, grid, geometry)
+    values: dict[str, Any] = {
+        "cn2": profile.cn2,
+        "cn2_standard_error": profile.error_map,
+        "cn2_standard_error_ml": profile.error_ml,
+        "cn2_at_bound": profile.at_bound,
+        "averaging_kernel": profile.averaging_kernel,
+        "degrees_of_freedom": profile.degrees_of_freedom,
+        "mu": profile.mu,
+        "log_mu_grid": profile.log_mu_grid,
+        "criterion": profile.criterion,
+        "slope_correlation": arrays["maps"][slope],
+        "slope_correlation_model": fitted[slope],
+        "slope_correlation_error": deviation[slope],
+        "intensity_correlation": arrays["maps"][intensity],
+        "intensity_correlation_model": fitted[intensity],
+        "intensity_correlation_error": deviation[intensity],
+        "r0_profile": turbulence.fried_parameter(profile.cn2, grid, geometry),
+        "scintillation_index_direct": arrays["scintillation_index"],
+        "scintillation_index_profile": turbulence.scintillation_index(profile.cn2, model.matrix, geometry),
+        "scintillation_index_point": point,
+        "mean_flux": arrays["mean_flux"],
+        "noise_variance_slope": joint("noise_bias_x", "noise_bias_y"),
+        "noise_variance_intensity": joint("noise_bias_i")[0],
+        "slope_offset": joint("slope_offset_x", "slope_offset_y"),
+        "n_frames": arrays["n_frames"],
+        "n_effective": arrays["n_effective"],
+        "valid_fraction": arrays["valid_fraction"],
+        "chi2_reduced": profile.chi2_reduced,
+    }
+    negative = any(
+        value < -3 * error for name, (value, error) in unknown.items() if name.startswith("noise") and error > 0
+    )
+    quality = reduced.quality_flag
+    for name, applies in (
+        ("mu_at_edge", profile.selection.at_edge),
+        ("negative_noise", negative),
+        ("poor_fit", profile.chi2_reduced > 3),
+        ("strong_scintillation", point > 0.3),
+    ):
+        quality |= QUALITY_FLAGS[name][0] * bool(applies)
+    return BatchResult(
+        start=reduced.start,
+        stop=reduced.stop,
+        values={name: np.asarray(value) for name, value in values.items()},
+        quality_flag=quality,
+    )
+
+
+def failed(start: int, stop: int, reason: str) -> BatchResult:
+    """The result of a batch that could not be processed."""
+    return BatchResult(start, stop, {}, QUALITY_FLAGS["failed"][0], reason)
