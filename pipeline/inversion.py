@@ -75,7 +75,7 @@ _OFFSET_BLOCKS = {"slope_offset_x": (0, 2), "slope_offset_y": (1, 3)}
 
 
 def log_mu_grid(low: float = 23.0, high: float = 33.0, step: float = 0.25) -> Floats:
-    """Grid of log10(mu / m^(4/3)), both ends included.
+    """Grid of log10(mu / m^(4/3)).
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def log_mu_grid(low: float = 23.0, high: float = 33.0, step: float = 0.25) -> Fl
         Ends of the range. Sauvage et al. 2021 search from 23 to 33, or from 25 where Cn2 is known to stay below
         10^-12.5 m^(-2/3).
     step : float
-        Step, > 0. The last step is shortened or stretched by less than half of it so that `high` is reached.
+        Step, > 0. The grid ends at the last step that does not exceed `high`.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def log_mu_grid(low: float = 23.0, high: float = 33.0, step: float = 0.25) -> Fl
     """
     if not (np.isfinite([low, high, step]).all() and high >= low and step > 0):
         raise ValueError(f"log mu range {low:g}:{high:g}:{step:g}: needs LOW <= HIGH and STEP > 0")
-    return np.linspace(low, high, round((high - low) / step) + 1)
+    return np.asarray(low + step * np.arange(int((high - low) / step + 1e-9) + 1))
 
 
 # --- rows ------------------------------------------------------------------------------------------------
