@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..pipeline.scenario import Realised, ScenarioError, read
 from ..pipeline.units import safe, text
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..pipeline.scenario import Recording, Scenario
+
+    Codec = Literal["lz4", "zstd"]
 
 #: Frames that are drawn at once and stored in one chunk.
 CHUNK_FRAMES = 256
@@ -114,7 +116,8 @@ def simulate(
     duration: float | None = None,
     seed: int | None = None,
     threads: int | None = None,
-    codec: str = "lz4",
+    codec: Codec = "lz4",
+    overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Path]:
     """Write every archive of a scenario, and the truth of each beside it.
@@ -124,7 +127,8 @@ def simulate(
     scenario : str, pathlib.Path or Scenario
         Scenario file, name of a shipped scenario, or one already read.
     output : pathlib.Path
-        The archive, if its name ends in ``.zarr`` or ``.zip``; else a folder that gets ``<archive>.zarr.zip`` for each.
+        The archive, if its name ends in ``.zarr`` or ``.zip``; else a folder that gets ``<archive>.zarr.zip``
+        for each.
     duration : float, optional
         Seconds of each recording, instead of those of the scenario.
     seed : int, optional
@@ -133,6 +137,8 @@ def simulate(
         Threads that draw frames; one per core where absent. The frames do not depend on it.
     codec : {"lz4", "zstd"}
         Compression of the archives: fast, or small.
+    overwrite : bool
+        Replace archives that are there already.
     progress : callable, optional
         Called with (name of the archive, frames written, frames in all).
 
@@ -145,6 +151,8 @@ def simulate(
     ------
     InputError
         The scenario has faults, or several archives are to go into one.
+    FileExistsError
+        An archive is there already and `overwrite` is false.
     """
     origin = safe(str(scenario)) if isinstance(scenario, (str, Path)) else "scenario"
     plan = load_scenario(scenario) if isinstance(scenario, (str, Path)) else scenario
@@ -165,7 +173,7 @@ def simulate(
     for recording in recordings(plan, origin):
         name = str(recording.attributes["archive"])
         path = output if single else output / f"{name}{SUFFIX}"
-        write_recording(recording, path, threads=threads, codec=codec, progress=progress)
+        write_recording(recording, path, threads=threads, codec=codec, overwrite=overwrite, progress=progress)
         written.append(path)
     return written
 
@@ -175,7 +183,8 @@ def write_recording(
     path: Path,
     *,
     threads: int | None = None,
-    codec: str = "lz4",
+    codec: Codec = "lz4",
+    overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> None:
     """Write one recording and its truth.
@@ -186,10 +195,10 @@ def write_recording(
         Frames to draw.
     path : pathlib.Path
         The archive.
-    threads, codec, progress
+    threads, codec, overwrite, progress
         As for :func:`simulate`.
     """
-    from ..catalog.archive import write_archive
+    from ..catalog.archive_writer import write_archive
 
     realised = Realised()
     name = str(recording.attributes["archive"])
@@ -214,6 +223,7 @@ def write_recording(
         frames(),
         chunk_frames=CHUNK_FRAMES,
         codec=codec,
+        overwrite=overwrite,
         **calibration,
     )
     truth_path(path).write_text(json.dumps(recording.truth(realised), indent=1) + "\n", "utf-8")
@@ -230,7 +240,8 @@ def simulate_recording(
     *,
     scenario: str = "lannemezan-strong",
     threads: int | None = None,
-    codec: str = "lz4",
+    codec: Codec = "lz4",
+    overwrite: bool = False,
 ) -> Path:
     """Write one recording with a given number of frames, as benchmarks need it.
 
@@ -242,7 +253,7 @@ def simulate_recording(
         Number of frames.
     scenario : str
         Scenario whose first archive is made, with no frame dropped.
-    threads, codec
+    threads, codec, overwrite
         As for :func:`simulate`.
 
     Returns
@@ -258,7 +269,7 @@ def simulate_recording(
     recording = recordings(plan)[0]
     exact = replace(recording, time=recording.time[:frames], index=recording.index[:frames])
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_recording(exact, path, threads=threads, codec=codec)
+    write_recording(exact, path, threads=threads, codec=codec, overwrite=overwrite)
     return path
 
 
@@ -268,7 +279,7 @@ def _settings(scenario: Scenario, origin: str) -> Settings:
 
 
 def _drawn(recording: Recording, threads: int) -> Iterator[tuple[Any, Any, NDArray[np.uint16]]]:
-    """Signals and frames of one chunk after the other, drawn by several threads a little ahead of the writer."""
+    """Signals and frames chunk by chunk, drawn by several threads a little ahead of the writer."""
 
     def draw(start: int) -> tuple[Any, Any, NDArray[np.uint16]]:
         stop = min(start + CHUNK_FRAMES, recording.n_frames)

@@ -215,8 +215,8 @@ def spot_profile(
     result = np.empty((2, distance.size), dtype=np.float32)
     for axis in (0, 1):
         across = (zero, lever * frequency) if axis == 0 else (lever * frequency, zero)
-        # The spot is where its slope says: the source's own centroid is part of its position, not of its shape.
-        transfer = np.abs(source.transfer(*across))
+        # The transform of the symmetric part of the profile; the centroid of a source is at its position.
+        transfer = np.real(source.transfer(*across))
         if shape == "gaussian":
             image = (1.0 - frequency / cutoff) * transfer
             result[axis] = _gaussian(distance, _half_width(frequency, weights * image) / pixel_scale)

@@ -344,9 +344,7 @@ class TurbulentField:
                 _LOWEST_FREQUENCY * np.maximum(within, 1e-12) ** 3,
                 np.exp(self._log_edges[np.maximum(place, 1) - 1] + within * width),
             )
-            density[layer] = np.where(
-                low, share * np.cbrt(frequency[layer] / _LOWEST_FREQUENCY) / 3.0, share / width
-            )
+            density[layer] = np.where(low, share * np.cbrt(frequency[layer] / _LOWEST_FREQUENCY) / 3.0, share / width)
         z = (self._bottom[:, None] + depth * self._depth[:, None]).ravel()
         f, angle = frequency.ravel(), np.pi * turn.ravel()
         fx, fy = f * np.cos(angle), f * np.sin(angle)
@@ -432,4 +430,5 @@ class TurbulentField:
         last = int(epoch[-1]) + 1
         weight = np.bincount(epoch, 1.0 - new, last + 1) + np.bincount(epoch + 1, new, last + 1)
         profiles = [self.strength.at(e * self.epoch_frames / self.frame_rate) for e in range(last + 1)]
-        return np.asarray(weight @ np.asarray(profiles) / frames.size)
+        # Weights that add up to one: an unchanging profile comes out as it went in.
+        return np.asarray((weight / weight.sum()) @ np.asarray(profiles))
