@@ -1,8 +1,8 @@
 """Raw frame archives, format 1: open, validate, read.
 
-An archive is one uninterrupted recording of Shack-Hartmann frames with everything that is needed to interpret
-them, as a zarr v3 group in a folder, a zip file or behind a URL. :func:`open_archive` reports everything that is
-wrong with one, together; what it returns can be read by any number of threads and processes.
+An archive is one uninterrupted recording of Shack-Hartmann frames with everything that is needed to
+interpret them, as a zarr v3 group in a folder, a zip file or behind a URL. :func:`open_archive` reports
+everything that is wrong with one, together; what it returns can be read by any number of threads and processes.
 """
 
 from __future__ import annotations
@@ -31,6 +31,8 @@ FRAME_DTYPES = ("uint8", "uint16", "int16", "float32")
 MAX_FRAME = 4096
 #: A zarr.json is a few hundred bytes; nothing as large as this is read.
 MAX_METADATA_BYTES = 4 * 2**20
+#: Nesting of JSON that later stages can rely on.
+MAX_DEPTH = 40
 #: The median step of time agrees with 1 / frame_rate within this fraction.
 RATE_TOLERANCE = 0.01
 #: A step longer than this many frame periods is a gap.
@@ -194,10 +196,8 @@ class Archive:
 
     @property
     def checksums(self) -> bool:
-        """Whether a changed bit in a chunk of frames is noticed: by crc32c, or by the checksums of a zip file."""
-        return "crc32c" in self.codecs or (
-            self._frames.store.checksums and self._frames.spec.sharding is None
-        )
+        """Whether a changed bit in a chunk of frames is noticed: by crc32c, or by a zip file's checksums."""
+        return "crc32c" in self.codecs or (self._frames.store.checksums and self._frames.spec.sharding is None)
 
     @property
     def stored_bytes(self) -> int:
@@ -259,9 +259,9 @@ class Archive:
     def identity(self) -> str:
         """Content identity: 64 hexadecimal digits, independent of path and of folder or zip.
 
-        Covers the attributes, the time stamps, dark, flat and bad pixels, the stored size of every chunk of frames
-        and the stored bytes of the first and the last of them: enough to tell two recordings apart without reading
-        them whole.
+        Covers the attributes, the time stamps, dark, flat and bad pixels, the stored size of every chunk of
+        frames and the stored bytes of the first and the last of them: enough to tell two recordings apart
+        without reading them whole.
         """
         digest = hashlib.sha256()
         spec = self._frames.spec
@@ -295,10 +295,10 @@ def open_archive(url: str | os.PathLike[str], *, allow_missing: bool = False) ->
     Parameters
     ----------
     url : str or path
-        A folder, a ``.zip``, or a URL of either that fsspec can open (``https://``, ``s3://``, ``memory://``, …).
+        A folder, a ``.zip``, or a URL of either that fsspec can open (``https://``, ``s3://``, ``memory://``).
     allow_missing : bool
-        Open an archive of which some chunks of frames are missing; they are listed in `missing_chunks` and reading
-        one raises :class:`ChunkError`. Otherwise a missing chunk is a fault as any other.
+        Open an archive of which some chunks of frames are missing; they are listed in `missing_chunks` and
+        reading one raises :class:`ChunkError`. Otherwise a missing chunk is a fault as any other.
 
     Returns
     -------
@@ -345,19 +345,32 @@ def _finite(text: str) -> float:
     return value
 
 
+def _depth(value: Any) -> int:
+    depth = 0
+    level = [value]
+    while level := [
+        item
+        for parent in level
+        if isinstance(parent, (dict, list))
+        for item in (parent.values() if isinstance(parent, dict) else parent)
+    ]:
+        depth += 1
+    return depth
+
+
 def _json(store: Store, key: str, fault: Faults) -> dict[str, Any] | None:
     """The JSON object under a key; None, and a fault unless it is absent, where there is none."""
     size = next(store.sizes("", [key]))
     if size is None:
         return None
     if size > MAX_METADATA_BYTES:
-        fault.say(
-            f"{key} holds {size} bytes, at most {MAX_METADATA_BYTES} are read; it is no metadata of an archive"
-        )
+        fault.say(f"{key} holds {size} bytes, at most {MAX_METADATA_BYTES} are read; it is no metadata of an archive")
         return {}
     try:
         text = store.read(key, verify=True).decode()
         found = json.loads(text, object_pairs_hook=_pairs, parse_float=_finite, parse_constant=_finite)
+        if _depth(found) > MAX_DEPTH:
+            raise ValueError(f"nested more than {MAX_DEPTH} deep")
         # Lone surrogates are legal in JSON, but nothing later can write them.
         json.dumps(found, ensure_ascii=False).encode()
     except (ValueError, RecursionError) as error:
@@ -379,16 +392,15 @@ def _group(store: Store, fault: Faults) -> dict[str, Any] | None:
     elif document.get("zarr_format") != 3 or document.get("node_type") != "group":
         found = f"node_type {document.get('node_type')!r}, zarr_format {document.get('zarr_format')!r}"
         fault.say(
-            f"this is no raw frame archive: zarr.json has {found}, expected a 'group' of format 3; name the group"
+            f"this is no raw frame archive: zarr.json has {found}, expected a 'group' of format 3; "
+            "name the group that holds the array 'frames'"
         )
     elif not isinstance(attributes := document.get("attributes"), dict) or attributes.get("format") != FORMAT:
-        found = attributes.get("format") if isinstance(attributes, dict) else None
-        if found is None:
-            fault.say(
-                f"this is a zarr group but no raw frame archive: format is missing, expected '{FORMAT}'"
-            )
+        written = attributes.get("format") if isinstance(attributes, dict) else None
+        if written is None:
+            fault.say(f"this is a zarr group but no raw frame archive: format is missing, expected '{FORMAT}'")
         else:
-            fault("format", found, f"this is a zarr group but no raw frame archive, expected '{FORMAT}'")
+            fault("format", written, f"this is a zarr group but no raw frame archive, expected '{FORMAT}'")
     elif type(version := attributes.get("format_version")) is not int or version != FORMAT_VERSION:
         fault("format_version", version, f"this version of coslidar reads format {FORMAT_VERSION}")
     else:
@@ -400,9 +412,12 @@ def _instead(store: Store) -> str:
     if next(store.sizes("", [".zgroup"])) is not None:
         return "it is a zarr group of format 2, expected format 3; convert it and write it again"
     members = getattr(store, "members", {})
-    nested = next((key for key in members if key.endswith("/zarr.json") and "frames/" not in key), None)
+    nested = min((key for key in members if key.endswith("/zarr.json")), key=len, default=None)
     if nested is not None and nested.removesuffix("/zarr.json") not in _ARRAYS:
-        return f"zarr.json must be at the root of the zip, found '{nested}'; pack the contents of the folder, not the folder"
+        return (
+            f"zarr.json must be at the root of the zip, found '{nested}'; "
+            "pack the contents of the folder, not the folder"
+        )
     return "there is no zarr.json in it; name the folder, zip or URL that a recording was written to"
 
 
@@ -412,9 +427,7 @@ def _instead(store: Store) -> str:
 class _Opening:
     """One pass over an archive that collects every fault before anything large is read."""
 
-    def __init__(
-        self, url: str, store: Store, attributes: dict[str, Any], fault: Faults, allow_missing: bool
-    ) -> None:
+    def __init__(self, url: str, store: Store, attributes: dict[str, Any], fault: Faults, allow_missing: bool) -> None:
         self.url, self.store, self.attributes, self.fault = url, store, attributes, fault
         self.allow_missing = allow_missing
 
@@ -438,7 +451,8 @@ class _Opening:
             if name in found and frames_spec is not None and found[name].spec.shape == frames_spec.shape[1:]
         }
         self.fault.raise_any()
-        assert header is not None and time is not None
+        assert header is not None
+        assert time is not None
         return Archive(
             url=self.url,
             header=header,
@@ -460,15 +474,11 @@ class _Opening:
         document = _json(self.store, f"{name}/zarr.json", self.fault)
         if document is None:
             if required:
-                self.fault.say(
-                    f"{name} is missing (no {name}/zarr.json); an archive needs this array; write it again"
-                )
+                self.fault.say(f"{name} is missing (no {name}/zarr.json); an archive needs this array; write it again")
             return None
         if len(self.fault.sentences) > before:
             return None
-        spec = parse_array(
-            name, document, dtypes, dimensions, self.fault, dimensions_required=name == "frames"
-        )
+        spec = parse_array(name, document, dtypes, dimensions, self.fault, dimensions_required=name == "frames")
         if spec is not None and name != "time" and max(spec.shape[-2:]) > MAX_FRAME:
             found = list(spec.shape)
             self.fault(
@@ -487,12 +497,7 @@ class _Opening:
             return None
         if not missing.keys:
             return array
-        if (
-            spec.name == "frames"
-            and self.allow_missing
-            and missing.complete
-            and len(missing.keys) < missing.total
-        ):
+        if spec.name == "frames" and self.allow_missing and missing.complete and len(missing.keys) < missing.total:
             self.missing_frames = missing.keys
             return array
         self._missing(spec, missing)
@@ -501,8 +506,8 @@ class _Opening:
     def _missing(self, spec: ArraySpec, missing: Missing) -> None:
         count = f"{'' if missing.complete else 'at least '}{len(missing.keys)} of {missing.total}"
         self.fault.say(
-            f"{spec.name}: {count} chunks are missing or empty: {missing}. A missing chunk is damage, never zeros; "
-            "copy the archive again from where it was recorded"
+            f"{spec.name}: {count} chunks are missing or empty: {missing}. A missing chunk is damage, never "
+            "zeros; copy the archive again from where it was recorded"
         )
 
     def _read(self, array: StoredArray) -> NDArray[Any] | None:
@@ -527,16 +532,15 @@ def check_boxes(attributes: dict[str, Any], frame_shape: tuple[int, int], fault:
     instrument = attributes.get("instrument")
     if not isinstance(instrument, dict):
         return
-    mask, origin, pitch = (
-        instrument.get(f"{k}") for k in ("subaperture_mask", "lenslet_origin", "lenslet_pitch")
-    )
+    mask, origin, pitch = (instrument.get(f"{k}") for k in ("subaperture_mask", "lenslet_origin", "lenslet_pitch"))
     pairs = (origin, pitch)
     if not all(isinstance(p, list) and len(p) == 2 and all(type(n) is int for n in p) for p in pairs):
         return
     if not isinstance(mask, list) or not all(isinstance(row, list) for row in mask):
         return
     used = [(i, j) for i, row in enumerate(mask) for j, lenslet in enumerate(row) if lenslet == 1]
-    assert isinstance(origin, list) and isinstance(pitch, list)
+    assert isinstance(origin, list)
+    assert isinstance(pitch, list)
     outside = [
         index
         for index in used
@@ -551,8 +555,8 @@ def check_boxes(attributes: dict[str, Any], frame_shape: tuple[int, int], fault:
         rows, cols = frame_shape
         fault.say(
             f"instrument.lenslet_origin = {origin!r}, instrument.lenslet_pitch = {pitch!r}: the boxes of "
-            f"{len(outside)} exploited lenslets reach beyond the frames of {rows} x {cols} pixels (row, col), first "
-            f"that of lenslet ({i}, {j}); correct them, or subaperture_mask"
+            f"{len(outside)} exploited lenslets reach beyond the frames of {rows} x {cols} pixels (row, col), "
+            f"first that of lenslet ({i}, {j}); correct them, or subaperture_mask"
         )
 
 
@@ -565,9 +569,11 @@ def check_time(time: NDArray[np.int64], attributes: dict[str, Any], fault: Fault
     if late.size:
         i = int(late[0]) + 1
         fault(
-            f"time[{i}]", int(time[i]), f"not later than time[{i - 1}] = {int(time[i - 1])} ({late.size} such steps); "
-            "time must increase strictly: start of each exposure in ns since 1970-01-01T00:00:00 UTC",
-        )  # fmt: skip
+            f"time[{i}]",
+            int(time[i]),
+            f"not later than time[{i - 1}] = {int(time[i - 1])} ({late.size} such steps); time must increase "
+            "strictly: start of each exposure in ns since 1970-01-01T00:00:00 UTC",
+        )
         return
     instrument = attributes.get("instrument")
     written = instrument.get("frame_rate") if isinstance(instrument, dict) else None
@@ -578,10 +584,11 @@ def check_time(time: NDArray[np.int64], attributes: dict[str, Any], fault: Fault
     median = _median_step(time)
     if rate > 0 and abs(median * rate / 1e9 - 1) > RATE_TOLERANCE:
         fault(
-            "instrument.frame_rate", written, f"the median step of time is {median / 1e6:.6g} ms ({1e9 / median:.6g} Hz), "
-            f"but 1 / frame_rate is {1e3 / rate:.6g} ms; they must agree within {RATE_TOLERANCE:.0%}; correct frame_rate, "
-            "or time (in ns)",
-        )  # fmt: skip
+            "instrument.frame_rate",
+            written,
+            f"the median step of time is {median / 1e6:.6g} ms ({1e9 / median:.6g} Hz), but 1 / frame_rate is "
+            f"{1e3 / rate:.6g} ms; they must agree within {RATE_TOLERANCE:.0%}; correct frame_rate, or time (ns)",
+        )
 
 
 def find_gaps(time: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -635,8 +642,8 @@ def describe(archive: Archive) -> dict[str, Any]:
     Returns
     -------
     dict
-        Names, counts, times and sizes, with units in the text of what has a dimension; under ``"notes"`` sentences on
-        what is legal but worth knowing.
+        Names, counts, times and sizes, with units in the text of what has a dimension; under ``"notes"``
+        sentences on what is legal but worth knowing.
     """
     from ..pipeline.units import text
 
@@ -689,9 +696,7 @@ def notes(archive: Archive) -> list[str]:
             f"at most {lost} at once (after frame {before})"
         )
     if archive.missing_chunks:
-        said.append(
-            f"{len(archive.missing_chunks)} chunks of frames are missing, first {archive.missing_chunks[0]}"
-        )
+        said.append(f"{len(archive.missing_chunks)} chunks of frames are missing, first {archive.missing_chunks[0]}")
     if not archive.checksums:
         said.append("the frames carry no checksum (codec crc32c): a flipped bit may read as wrong data")
     if archive.dark is None:
@@ -703,13 +708,10 @@ def notes(archive: Archive) -> list[str]:
     if archive.flat is not None and good.any():
         values = archive.flat[good & np.isfinite(archive.flat)]
         if np.any(values <= 0):
-            said.append(
-                f"flat is not positive in {int(np.sum(values <= 0))} pixels that bad_pixel does not mark"
-            )
-        if values.size and abs(float(values.mean(dtype=np.float64)) - 1) > 0.1:
-            said.append(
-                f"the mean of flat is {float(values.mean(dtype=np.float64)):.3g}, not 1: fluxes are scaled by it"
-            )
+            said.append(f"flat is not positive in {int(np.sum(values <= 0))} pixels that bad_pixel does not mark")
+        mean = float(values.mean(dtype=np.float64)) if values.size else 1.0
+        if abs(mean - 1) > 0.1:
+            said.append(f"the mean of flat is {mean:.3g}, not 1: fluxes are scaled by it")
     if not good.any():
         said.append("bad_pixel marks every pixel")
     return said

@@ -91,7 +91,7 @@ class Blosc:
                 blosc.decompress(data, out)
             except (RuntimeError, ValueError) as error:
                 raise DamagedChunk(f"blosc cannot decode it ({error})") from error
-        return memoryview(out)
+        return out.data
 
     def encoded_size(self, size: int | None) -> int | None:
         """See :class:`Codec`."""
@@ -114,7 +114,7 @@ class Zstd:
             zstd.decompress(data, out)
         except (RuntimeError, ValueError) as error:
             raise DamagedChunk(f"zstd cannot decode it ({error})") from error
-        return memoryview(out)
+        return out.data
 
     def encoded_size(self, size: int | None) -> int | None:
         """See :class:`Codec`."""
@@ -324,8 +324,8 @@ class StoredArray:
     store : Store
         Where its bytes are.
     place : ndarray of int64
-        (chunks, 2), in C order of the grid: offset in the stored object and stored size; size -1 where the chunk
-        is missing.
+        (chunks, 2), in C order of the grid: offset in the stored object and stored size; size -1 where the
+        chunk is missing.
     """
 
     spec: ArraySpec
@@ -399,9 +399,7 @@ class StoredArray:
                 out = np.empty(shape, spec.dtype)
             index = _unravel(across, spec.grid[1:])
             begins = [i * c for i, c in zip(index, spec.chunk_shape[1:], strict=True)]
-            region = out[
-                (slice(None), *(slice(b, b + c) for b, c in zip(begins, spec.chunk_shape[1:], strict=True)))
-            ]
+            region = out[(slice(None), *(slice(b, b + c) for b, c in zip(begins, spec.chunk_shape[1:], strict=True)))]
             region[...] = chunk[tuple(slice(0, n) for n in region.shape)]
         assert out is not None
         return out
@@ -414,9 +412,9 @@ class StoredArray:
 # --- metadata ----------------------------------------------------------------------------------------------
 
 _KNOWN_KEYS = {
-    "zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding", "fill_value", "codecs",
-    "attributes", "storage_transformers", "dimension_names",
-}  # fmt: skip
+    *("zarr_format", "node_type", "shape", "data_type", "chunk_grid", "chunk_key_encoding", "fill_value"),
+    *("codecs", "attributes", "storage_transformers", "dimension_names"),
+}
 
 
 def _sizes(value: Any) -> tuple[int, ...] | None:
@@ -535,9 +533,11 @@ def parse_array(
         size = math.prod(chunk) * np.dtype(data_type).itemsize
         if size > MAX_CHUNK_BYTES:
             wrong(
-                "chunk_grid", list(chunk), f"a chunk would hold {size / 2**20:.0f} MiB uncompressed, at most "
+                "chunk_grid",
+                list(chunk),
+                f"a chunk would hold {size / 2**20:.0f} MiB uncompressed, at most "
                 f"{MAX_CHUNK_BYTES // 2**20} MiB are allowed; write with smaller chunks (256 frames are usual)",
-            )  # fmt: skip
+            )
     if before[0] or shape is None or data_type is None or stored is None or chunk is None or chain is None:
         return None
     return ArraySpec(name, shape, np.dtype(data_type), chunk, chain, sharding, stored, prefix, separator)
@@ -555,9 +555,7 @@ def _parse_sharding(
         inner is None or len(inner) != len(stored) or any(s % c for s, c in zip(stored, inner, strict=True))
     ):
         found = settings.get("chunk_shape")
-        wrong(
-            "codecs[0].configuration.chunk_shape", found, f"must divide the shape of a shard, {list(stored)}"
-        )
+        wrong("codecs[0].configuration.chunk_shape", found, f"must divide the shape of a shard, {list(stored)}")
         inner = None
     if inner is not None and stored is not None and math.prod(stored) // math.prod(inner) > _MAX_PER_SHARD:
         wrong(
@@ -593,11 +591,7 @@ def _parse_chain(codecs: Any, path: str, data_type: str | None, ndim: int, wrong
         names.append(str(name))
         if name == "transpose" and not seen_bytes:
             order = settings.get("order")
-            if (
-                not isinstance(order, list)
-                or len(order) != ndim
-                or {*map(repr, order)} != {*map(repr, range(ndim))}
-            ):
+            if not isinstance(order, list) or len(order) != ndim or {*map(repr, order)} != {*map(repr, range(ndim))}:
                 wrong(f"{where}.configuration.order", order, f"must be a permutation of {list(range(ndim))}")
                 good = False
             else:
@@ -605,9 +599,7 @@ def _parse_chain(codecs: Any, path: str, data_type: str | None, ndim: int, wrong
         elif name == "bytes" and not seen_bytes:
             seen_bytes = True
             endian = settings.get("endian")
-            if endian not in ("little", "big") and not (
-                endian is None and data_type in ("uint8", "bool", None)
-            ):
+            if endian not in ("little", "big") and not (endian is None and data_type in ("uint8", "bool", None)):
                 wrong(f"{where}.configuration.endian", endian, "must be 'little' or 'big'")
                 good = False
             little = endian != "big"
@@ -694,9 +686,7 @@ def find_chunks(spec: ArraySpec, store: Store) -> tuple[StoredArray, Missing]:
             missing.append(key)
             # Their number is only what the metadata claims: do not go through billions that never were.
             if len(missing) > 100 and len(missing) > present:
-                return StoredArray(spec, store, np.empty((0, 2), np.int64)), Missing(
-                    tuple(missing), False, total
-                )
+                return StoredArray(spec, store, np.empty((0, 2), np.int64)), Missing(tuple(missing), False, total)
         found.append(size or -1)
     if spec.sharding is None:
         place = np.zeros((total, 2), np.int64)

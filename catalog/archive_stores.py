@@ -162,9 +162,7 @@ class ZipStore:
         size = member.size - start if size is None else size
         if start < 0 or size < 0 or start + size > member.size:
             raise StoreError(f"{key} holds {member.size} bytes, not {start + size}")
-        data = (
-            self._remote(key, member, start, size) if self.remote else self._local(key, member, start, size)
-        )
+        data = self._remote(key, member, start, size) if self.remote else self._local(key, member, start, size)
         if verify and whole and zlib.crc32(data) != member.checksum:
             raise StoreError("the zip file's checksum does not match: the stored bytes were changed")
         return data
@@ -229,8 +227,8 @@ def open_store(url: str) -> Store:
                 return ZipStore(url, False, length, _directory(file, length))
         except StoreError:
             raise
-        except OSError as error:
-            raise StoreError(f"the file cannot be read ({_said(error)})") from error
+        except Exception as error:  # a hostile directory makes zipfile raise nearly anything
+            raise StoreError(f"the zip file cannot be read ({_said(error)}); copy it again") from error
     fs, path = _file_system(url)
     if not (urlsplit(url).path or url).endswith(".zip"):
         return RemoteStore(url)
@@ -244,8 +242,8 @@ def open_store(url: str) -> Store:
         raise
     except Exception as error:
         raise StoreError(
-            f"the zip file cannot be read where it is ({_said(error)}); its server may not support byte ranges: "
-            "download it and open the copy"
+            f"the zip file cannot be read where it is ({_said(error)}); its server may not support byte "
+            "ranges: download it and open the copy"
         ) from error
 
 
@@ -264,25 +262,20 @@ def _directory(file: Any, length: int) -> dict[str, _Member]:
             entries = archive.infolist()
     except zipfile.BadZipFile as error:
         raise StoreError(
-            f"this is no zip file, or its end is cut off ({_said(error)}); copy it again, or open the folder instead"
+            f"this is no zip file, or its end is cut off ({_said(error)}); copy it again, or name the folder"
         ) from error
-    except Exception as error:  # a hostile directory makes zipfile raise nearly anything
-        if isinstance(error, OSError) and not isinstance(error, EOFError):
-            raise
-        raise StoreError(f"its zip directory cannot be read ({_said(error)}); copy it again") from error
     members: dict[str, _Member] = {}
     for entry in entries:
         if entry.is_dir():
             continue
         if entry.compress_type != zipfile.ZIP_STORED or entry.flag_bits & 0x1:
             raise StoreError(
-                f"member '{entry.filename[:100]}' is {'encrypted' if entry.flag_bits & 0x1 else 'compressed'}, but "
-                "members of an archive are stored as they are; unpack it and use the folder, or pack it with 'zip -0 -r'"
+                f"member '{entry.filename[:100]}' is {'encrypted' if entry.flag_bits & 0x1 else 'compressed'}, "
+                "but members of an archive are stored as they are; unpack it and name the folder, or pack the "
+                "contents of the folder with 'zip -0 -r'"
             )
         if entry.header_offset < 0 or entry.header_offset + entry.file_size > length:
-            raise StoreError(
-                f"member '{entry.filename[:100]}' ends beyond the end of the file; copy it again"
-            )
+            raise StoreError(f"member '{entry.filename[:100]}' ends beyond the end of the file; copy it again")
         # Later entries of one name replace earlier ones, as for every reader of zip files.
         members[entry.filename] = _Member(entry.header_offset, entry.file_size, entry.CRC)
     return members
@@ -314,9 +307,7 @@ def _absent(error: BaseException) -> bool:
     # fsspec reports every failure of an HTTP request for information as "not found"; only these mean it.
     # Object stores answer 403 for a key that is not there when listing is not permitted.
     cause = error.__cause__
-    return isinstance(error, FileNotFoundError) and (
-        cause is None or getattr(cause, "status", None) in (403, 404, 410)
-    )
+    return isinstance(error, FileNotFoundError) and (cause is None or getattr(cause, "status", None) in (403, 404, 410))
 
 
 def _remote_size(fs: Any, path: str) -> int | None:
@@ -325,15 +316,11 @@ def _remote_size(fs: Any, path: str) -> int | None:
     except Exception as error:
         if _absent(error):
             return None
-        raise StoreError(
-            f"the server does not answer as it should ({_said(error.__cause__ or error)})"
-        ) from error
+        raise StoreError(f"the server does not answer as it should ({_said(error.__cause__ or error)})") from error
     if entry.get("type") == "directory":
         return None
     if entry.get("size") is None:
-        raise StoreError(
-            "the server does not tell the size of its files; download the archive and open the copy"
-        )
+        raise StoreError("the server does not tell the size of its files; download the archive and open the copy")
     return int(entry["size"])
 
 

@@ -43,8 +43,8 @@ def write_archive(
     path : str or path
         Local folder to make, or a file where the name ends in ``.zip``.
     header : mapping
-        Attributes of the group, as the format wants them: text with units. ``format`` and ``format_version`` may be
-        left out.
+        Attributes of the group, as the format wants them: text with units. ``format`` and ``format_version``
+        may be left out.
     time : ndarray of int64
         (time,), start of each exposure, ns since 1970-01-01T00:00:00 UTC.
     frames : ndarray or iterable of ndarray
@@ -78,9 +78,7 @@ def write_archive(
     if codec not in _COMPRESSORS:
         raise ValueError(f"codec = {codec!r}: must be one of {', '.join(_COMPRESSORS)}")
     if os.path.lexists(target) and not overwrite:
-        raise FileExistsError(
-            f"{target} exists already; choose another name, or say that it may be overwritten"
-        )
+        raise FileExistsError(f"{target} exists already; choose another name, or say that it may be overwritten")
     attributes = {"format": "shwfs-frames", "format_version": 1, **header}
     time = np.asarray(time)
     blocks = iter([frames] if isinstance(frames, np.ndarray) else frames)
@@ -92,12 +90,7 @@ def write_archive(
     else:
         check_time(time, attributes, fault)
     planes: dict[str, NDArray[Any]] = {}
-    if (
-        first is None
-        or first.ndim != 3
-        or first.dtype.name not in FRAME_DTYPES
-        or max(first.shape[1:]) > MAX_FRAME
-    ):
+    if first is None or first.ndim != 3 or first.dtype.name not in FRAME_DTYPES or max(first.shape[1:]) > MAX_FRAME:
         found = None if first is None else f"{first.dtype} {first.shape}"
         fault(
             "frames",
@@ -120,9 +113,7 @@ def write_archive(
     chunk_frames = min(chunk_frames, len(time))
     size = chunk_frames * math.prod(first.shape[1:]) * first.dtype.itemsize
     if chunk_frames < 1 or size > MAX_CHUNK_BYTES:
-        raise ValueError(
-            f"chunk_frames = {chunk_frames}: a chunk must hold 1 frame to {MAX_CHUNK_BYTES // 2**20} MiB"
-        )
+        raise ValueError(f"chunk_frames = {chunk_frames}: a chunk must hold 1 frame to {MAX_CHUNK_BYTES // 2**20} MiB")
 
     target.parent.mkdir(parents=True, exist_ok=True)
     # In the same folder, so that the last step is a rename; hidden, so that no pattern finds half an archive.
@@ -159,7 +150,8 @@ def _chunked(
     while block is not None:
         if block.shape[1:] != first.shape[1:] or block.dtype != first.dtype:
             raise ValueError(
-                f"frames from {seen} on are {block.dtype} {block.shape[1:]}, those before {first.dtype} {first.shape[1:]}"
+                f"frames from {seen} on are {block.dtype} {block.shape[1:]}, "
+                f"those before {first.dtype} {first.shape[1:]}"
             )
         if seen + len(block) > total:
             raise ValueError(f"there are more frames than the {total} times")
@@ -207,15 +199,26 @@ def _write(
         arrays |= {key: (plane, ("row", "col")) for key, plane in planes.items()}
         for key, (values, dimensions) in arrays.items():
             array = group.create_array(
-                key, shape=values.shape, chunks=tuple(min(n, _MAX_SIDE) for n in values.shape), dtype=values.dtype, filters=(), dimension_names=dimensions,
-                compressors=compressors(values.dtype), config={"write_empty_chunks": True},
-            )  # fmt: skip
+                key,
+                shape=values.shape,
+                chunks=tuple(min(n, _MAX_SIDE) for n in values.shape),
+                dtype=values.dtype,
+                filters=(),
+                dimension_names=dimensions,
+                compressors=compressors(values.dtype),
+                config={"write_empty_chunks": True},
+            )
             array[...] = values
         stored = group.create_array(
-            "frames", shape=(len(time), *sample.shape[1:]), chunks=(chunk_frames, *sample.shape[1:]), dtype=sample.dtype,
-            filters=(), dimension_names=("time", "row", "col"), compressors=compressors(sample.dtype),
+            "frames",
+            shape=(len(time), *sample.shape[1:]),
+            chunks=(chunk_frames, *sample.shape[1:]),
+            dtype=sample.dtype,
+            filters=(),
+            dimension_names=("time", "row", "col"),
+            compressors=compressors(sample.dtype),
             config={"write_empty_chunks": True},
-        )  # fmt: skip
+        )
         for first, chunk in chunks:
             stored[first : first + len(chunk)] = chunk
     finally:

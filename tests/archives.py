@@ -48,7 +48,7 @@ _HEADER: dict[str, Any] = {
 
 
 def small_header(**changes: Any) -> dict[str, Any]:
-    """A valid header of 3 x 3 lenslets on 48 x 30 pixels; keys of `changes` are paths with ``__`` for the point.
+    """A valid header of 3 x 3 lenslets on 48 x 30 pixels; `changes` are paths with ``__`` for the point.
 
     ``small_header(archive="b", instrument__frame_rate="50 Hz")``; None removes the key.
     """
@@ -70,9 +70,7 @@ def small_time(n_frames: int, rate: float = 100.0) -> NDArray[np.int64]:
     return START + np.rint(np.arange(n_frames) * (1e9 / rate)).astype(np.int64)
 
 
-def small_frames(
-    header: dict[str, Any], n_frames: int, *, dtype: str = "uint16", seed: int = 0
-) -> NDArray[Any]:
+def small_frames(header: dict[str, Any], n_frames: int, *, dtype: str = "uint16", seed: int = 0) -> NDArray[Any]:
     """Frames with one Gaussian spot per source and exploited lenslet, whose place and flux vary at random."""
     rng = np.random.default_rng(seed)
     instrument = header["instrument"]
@@ -88,9 +86,7 @@ def small_frames(
             flux = peak * np.exp(rng.normal(0, 0.1, n_frames))
             y = np.exp(-((np.arange(pitch[0]) - centre[:, :1]) ** 2) / 2)
             x = np.exp(-((np.arange(pitch[1]) - centre[:, 1:]) ** 2) / 2)
-            frames[:, row : row + pitch[0], col : col + pitch[1]] += (
-                flux[:, None, None] * y[:, :, None] * x[:, None, :]
-            )
+            frames[:, row : row + pitch[0], col : col + pitch[1]] += flux[:, None, None] * y[:, :, None] * x[:, None, :]
     return (
         frames.astype(dtype)
         if dtype == "float32"
