@@ -116,7 +116,7 @@ def simulate(
     duration: float | None = None,
     seed: int | None = None,
     threads: int | None = None,
-    codec: Codec = "lz4",
+    codec: Codec | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Path]:
@@ -135,8 +135,8 @@ def simulate(
         Instead of that of the scenario.
     threads : int, optional
         Threads that draw frames; one per core where absent. The frames do not depend on it.
-    codec : {"lz4", "zstd"}
-        Compression of the archives: fast, or small.
+    codec : {"lz4", "zstd"}, optional
+        Compression of the archives, quick or small, instead of that of the scenario.
     overwrite : bool
         Replace archives that are there already.
     progress : callable, optional
@@ -183,7 +183,7 @@ def write_recording(
     path: Path,
     *,
     threads: int | None = None,
-    codec: Codec = "lz4",
+    codec: Codec | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> None:
@@ -222,7 +222,7 @@ def write_recording(
         recording.time,
         frames(),
         chunk_frames=CHUNK_FRAMES,
-        codec=codec,
+        codec=codec or recording.scenario.codec,
         overwrite=overwrite,
         **calibration,
     )
@@ -240,7 +240,7 @@ def simulate_recording(
     *,
     scenario: str = "lannemezan-strong",
     threads: int | None = None,
-    codec: Codec = "lz4",
+    codec: Codec | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Write one recording with a given number of frames, as benchmarks need it.

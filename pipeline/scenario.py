@@ -206,6 +206,8 @@ class Scenario(Parameters):
     detector: DetectorParameters = DetectorParameters()
     vibration: VibrationParameters | None = None
     disturbances: DisturbanceParameters = DisturbanceParameters()
+    codec: Literal["lz4", "zstd"] = "lz4"
+    """Compression of its archives: quick, or small."""
     spectrum: dict[str, Any] = Field(default_factory=lambda: {"name": "kolmogorov"})
     """Turbulence spectrum, by name and parameters."""
     source: dict[str, Any] = Field(default_factory=lambda: {"name": "gaussian"})
