@@ -10,7 +10,7 @@ import numpy as np
 from ..catalog.archive import open_archive
 from ..pipeline import batch as stages
 from ..pipeline import response
-from ..pipeline.lineage import Key, document, make_key
+from ..pipeline.lineage import Key, checkout, document, key
 from ..pipeline.units import safe
 from .settings import InputError
 
@@ -154,7 +154,8 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
     InputError
         Archive and settings do not fit each other.
     """
-    archive = open_archive(url, overlay=settings.header) if settings.header else open_archive(url)
+    # A missing chunk spoils its batch only; `inspect` calls it a fault.
+    archive = open_archive(url, overlay=settings.header, allow_missing=True)
     header = archive.header
     origin = safe(url)
     if settings.campaign is not None and header.campaign != settings.campaign:
@@ -173,12 +174,12 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
     sources = settings.source_models(header, origin)
     spectrum, regulariser, selector = settings.spectrum(), settings.regulariser(), settings.selector()
 
+    mark = checkout().mark
     instrument = header.instrument
-    measured = make_key(
+    measured = key(
         "measurements",
         stages.MEASURE_VERSION,
         tracked={
-            "archive": archive.identity,
             "extraction": configuration.extraction.model_dump(),
             "batch": configuration.batch.model_dump(),
             "detector": {
@@ -191,14 +192,17 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
                 "spots": [source.spot for source in header.sources],
             },
         },
+        upstream=[archive.identity],
+        mark=mark,
     )
-    reduction = make_key(
+    reduction = key(
         "correlation",
         stages.REDUCE_VERSION,
         tracked=configuration.correlation.model_dump(),
         upstream=[measured],
+        mark=mark,
     )
-    responses = make_key(
+    responses = key(
         "response",
         response.VERSION,
         tracked={
@@ -211,14 +215,16 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
             "wavelength": geometry.wavelength,
             "positions": geometry.positions,
         },
-        plugins=[*(source.identity() for source in sources), spectrum.identity()],
+        plugins={"sources": [source.identity() for source in sources], "spectrum": spectrum.identity()},
+        mark=mark,
     )
-    profile = make_key(
+    profile = key(
         "profile",
         stages.RETRIEVE_VERSION,
         tracked=configuration.inversion.model_dump(),
-        plugins=[regulariser.identity(), selector.identity()],
+        plugins={"regulariser": regulariser.identity(), "selector": selector.identity()},
         upstream=[reduction, responses],
+        mark=mark,
     )
     return ArchivePlan(
         url=url,

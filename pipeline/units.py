@@ -121,14 +121,13 @@ def text(value: float, unit: str) -> str:
     return f"{rounded(value):.15g} {unit}"
 
 
-@dataclass(frozen=True)
 class QuantityError(ValueError):
     """A quantity that cannot be read; the message says what was found and what was expected."""
 
-    reason: str
-
-    def __str__(self) -> str:
-        return self.reason
+    @property
+    def reason(self) -> str:
+        """The message."""
+        return str(self)
 
 
 _NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?"
@@ -168,9 +167,7 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
     word, examples = _KNOWN.get(unit, ("quantity", (f"1 {unit}",)))
     sample = ", ".join(f"'{example}'" for example in examples)
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise QuantityError(
-            f"a {type(value).__name__} is no quantity; {key} is {_article(word)}; write {sample}"
-        )
+        raise QuantityError(f"a {type(value).__name__} is no quantity; {key} is {_article(word)}; write {sample}")
     if not isinstance(value, str):
         example = examples[0] if unit not in ("m", "s", "Hz") else f"{value:g} {unit}"
         raise QuantityError(f"the unit is missing. {key} is {_article(word)}; write '{example}'")
@@ -179,9 +176,7 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
             f"use a point as decimal sign, not a comma; write '{comma[1]}.{comma[2]}{comma[3].rstrip()}'"
         )
     if len(value) > 200 or not (match := _QUANTITY.match(value)):
-        raise QuantityError(
-            f"this is no number with a unit; {key} is {_article(word)}; write for example {sample}"
-        )
+        raise QuantityError(f"this is no number with a unit; {key} is {_article(word)}; write for example {sample}")
     number, unit_text = float(match[1]), match[2]
     if math.isnan(number) or (math.isinf(number) and not allow_infinite):
         raise QuantityError(f"{key} must be a finite {word}, for example {sample}")
@@ -193,9 +188,7 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
     try:
         # "^" and "(-2/3)" are pint's own grammar; a second number would be a product, never meant.
         if re.match(rf"^\s*[*/]?\s*{_NUMBER}(?![\w)/])", unit_text):
-            raise QuantityError(
-                f"this is no single number with a unit; {key} is {_article(word)}; write {sample}"
-            )
+            raise QuantityError(f"this is no single number with a unit; {key} is {_article(word)}; write {sample}")
         found = registry.Unit(unit_text)
         wanted = registry.Unit(unit)
     except QuantityError:
@@ -272,23 +265,27 @@ class Quantity:
         """What to add to a fault."""
         return ""
 
-    def __get_pydantic_core_schema__(
-        self, source: object, handler: GetCoreSchemaHandler
-    ) -> core_schema.CoreSchema:
-        def read(value: object, info: core_schema.ValidationInfo) -> float:
+    def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+        def read(
+            value: object, bounds: core_schema.ValidatorFunctionWrapHandler, info: core_schema.ValidationInfo
+        ) -> float:
             try:
-                return self.read(value)
+                number = self.read(value)
             except QuantityError as error:
                 raise quantity_fault(error, info.field_name, self.note()) from error
+            try:
+                return float(bounds(number))
+            except ValidationError as error:
+                # Raised anew, so that the fault shows the text that was given and not the number made of it.
+                words = error.errors()[0]["msg"].replace("Input should", "it should")
+                raise quantity_fault(QuantityError(f"{words} {self.unit}"), info.field_name) from error
 
         def write(value: float) -> str:
             return text(value, self.unit)
 
-        return core_schema.chain_schema(
-            [
-                core_schema.with_info_plain_validator_function(read),
-                core_schema.float_schema(allow_inf_nan=self.infinite),
-            ],
+        return core_schema.with_info_wrap_validator_function(
+            read,
+            handler(source),  # carries the bounds of the field
             serialization=core_schema.plain_serializer_function_ser_schema(write, when_used="json"),
         )
 

@@ -1,0 +1,148 @@
+"""Commands that process: plan and run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ..settings import Settings
+
+
+def _inputs(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Arguments and options that name what to process."""
+    for decorate in (
+        click.option(
+            "--set", "assignments", multiple=True, metavar="KEY=VALUE",
+            help="Set one key on top of the campaign file; may be repeated: --set batch.duration='1 min'.",
+        ),
+        click.option(
+            "--slices", type=click.IntRange(1, 200), help="Number of equal slices (response.slices)."
+        ),
+        click.option(
+            "--sampling", type=click.Choice(["mean", "midpoint"]),
+            help="Response averaged over a slice or at its middle (response.sampling).",
+        ),
+        click.option(
+            "--out", type=click.Path(file_okay=False, path_type=Path),
+            help="Folder of the catalog.  [default: output of the campaign file, or ./results]",
+        ),
+        click.argument("inputs", metavar="CAMPAIGN.toml | ARCHIVE...", nargs=-1, required=True),
+    ):  # fmt: skip
+        command = decorate(command)
+    return command
+
+
+def settings_of(
+    inputs: tuple[str, ...],
+    out: Path | None,
+    assignments: tuple[str, ...] = (),
+    scheduler: str | None = None,
+    **shortcuts: Any,
+) -> Settings:
+    """Settings of a command line: a campaign file, archives, or both."""
+    from ..settings import InputError, load
+
+    campaigns = [item for item in inputs if item.endswith(".toml")]
+    archives = [item for item in inputs if not item.endswith(".toml")]
+    if len(campaigns) > 1:
+        raise InputError([f"{len(campaigns)} campaign files are given; process them one after the other"])
+    extra = [f"response.{key}={value}" for key, value in shortcuts.items() if value is not None]
+    settings = load(
+        Path(campaigns[0]) if campaigns else None,
+        archives=archives,
+        output=out,
+        assignments=[*assignments, *extra],
+        scheduler=scheduler,
+    )
+    if not settings.archives:
+        raise InputError([f"{settings.origin}: archives names none; write archives = ['raw/*.zarr.zip']"])
+    return settings
+
+
+@click.command()
+@_inputs
+def plan(
+    inputs: tuple[str, ...], out: Path | None, sampling: str | None, slices: int | None, assignments: tuple[str, ...]
+) -> None:
+    """Show what a run would read, compute and reuse; nothing is computed and nothing written."""
+    from ...catalog.archive import ArchiveError
+    from ...catalog.store import Catalog
+    from ...pipeline.units import safe
+    from ..cli import complain
+    from ..plan import plan_archive
+    from ..settings import InputError
+
+    settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
+    faults: list[str] = []
+    frames = computed = 0
+    catalog = Catalog.open(settings.output, create=False) if settings.output.exists() else None
+    for url in settings.archives:
+        try:
+            planned = plan_archive(url, settings)
+        except (ArchiveError, InputError) as error:
+            faults += error.faults
+            continue
+        digest, reduction = str(planned.profile_key), str(planned.reduction_key)
+        if catalog is not None and catalog.has(planned.archive.identity, digest) is not None:
+            click.echo(f"{planned.name}: {len(planned.windows)} batches, already in the catalog")
+            continue
+        new = list(planned.windows)
+        if catalog is not None:
+            new = [
+                window
+                for window in new
+                if not catalog.scratch.load_arrays("correlation", reduction, str(window.start_time))
+            ]
+        read = sum(window.stop - window.start for window in new)
+        frames += read
+        computed += len(planned.windows)
+        click.echo(
+            f"{safe(planned.name)}: {len(planned.windows)} batches to compute, {len(planned.windows) - len(new)} "
+            f"from kept correlations, {read} frames to read  (key {digest[:16]})"
+        )
+    click.echo(f"in all {computed} batches to compute, {frames} frames to read")
+    if faults:
+        complain(faults)
+        raise click.exceptions.Exit(2)
+
+
+@click.command()
+@_inputs
+@click.option("--scheduler", metavar="ADDRESS|FILE", help="Dask cluster to compute on; this machine without.")
+@click.option("--no-prefect", is_flag=True, help="Without the Prefect server: the same results, a quicker start.")
+@click.option("-q", "--quiet", is_flag=True, help="Say only what went wrong.")
+def run(
+    inputs: tuple[str, ...],
+    out: Path | None,
+    sampling: str | None,
+    slices: int | None,
+    assignments: tuple[str, ...],
+    scheduler: str | None,
+    no_prefect: bool,
+    quiet: bool,
+) -> None:
+    """Turn recordings into catalogued Cn2 profiles.
+
+    Give a campaign file, raw archives (folders, .zip files, URLs), or both. What the catalog already holds is not
+    computed again; a run that was interrupted goes on where it was. One bad archive or batch does not stop the others.
+    """
+    from ..progress import progress
+    from ..run import run as process
+
+    settings = settings_of(inputs, out, assignments, scheduler, sampling=sampling, slices=slices)
+    with progress(len(settings.archives), quiet) as watcher:
+        outcomes = process(settings, watcher, prefect=not no_prefect)
+    published = [outcome for outcome in outcomes if outcome.status in ("published", "present")]
+    if not quiet and published:
+        click.echo(f"{len(published)} of {len(outcomes)} archives are in {settings.output}")
+        source = inputs[0] if inputs[0].endswith(".toml") else published[0].product
+        click.echo(f"Next: coslidar report {source} -o report.html")
+    if any(outcome.input_fault for outcome in outcomes):
+        raise click.exceptions.Exit(2)
+    if any(outcome.status == "failed" or outcome.failed_batches for outcome in outcomes):
+        raise click.exceptions.Exit(1)

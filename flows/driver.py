@@ -1,0 +1,312 @@
+"""From settings to published products. Imports neither Prefect nor, by itself, Dask.
+
+An archive is planned, its batches are sent to the workers, what comes back is kept in a scratch store, and once all
+are there they become one product. The catalog and the scratch store are the only memory: killed at any moment, the
+same command goes on where it was.
+"""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ..catalog.archive import ArchiveError
+from ..catalog.products import assemble
+from ..pipeline import batch as stages
+from ..pipeline import response
+from ..pipeline.units import safe
+from ..plugins.registry import PluginError
+from .cluster import BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
+from .plan import ArchivePlan, BatchWindow, plan_archive
+from .settings import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator
+
+    import numpy as np
+    from distributed import Client
+    from numpy.typing import NDArray
+
+    from ..catalog.store import Catalog
+    from ..pipeline.products import BatchResult
+    from .settings import Settings
+
+log = logging.getLogger("coslidar")
+
+#: Batches per worker thread that are under way at once: enough that none idles, few enough that memory stays flat.
+AHEAD = 2
+
+
+class Progress(Protocol):
+    """What wants to know how far a run is."""
+
+    def planned(self, archive: str, batches: int) -> None:
+        """An archive begins, with so many batches to compute."""
+
+    def advanced(self, archive: str, index: int, reason: str) -> None:
+        """A batch is done; `reason` says why it failed, if it did."""
+
+    def finished(self, outcome: ArchiveOutcome) -> None:
+        """An archive is done."""
+
+
+@dataclass(frozen=True)
+class ArchiveOutcome:
+    """What became of one archive.
+
+    Parameters
+    ----------
+    url : str
+        Where it is.
+    name : str
+        Campaign and archive; the url where it could not be opened.
+    status : str
+        ``published``, ``present`` (nothing to do), ``refused`` (its input is at fault) or ``failed``.
+    batches, failed_batches, reused, frames_read : int
+        Batches in all, those that failed, those that were there already, and frames that were read.
+    faults : tuple of str
+        Why the archive was refused or failed, or which batches did.
+    product : str
+        Path of the product in the catalog.
+    input_fault : bool
+        Whether the fault lies in the data (exit code 2) rather than in the run.
+    """
+
+    url: str
+    name: str
+    status: str
+    batches: int = 0
+    failed_batches: int = 0
+    reused: int = 0
+    frames_read: int = 0
+    faults: tuple[str, ...] = ()
+    product: str = ""
+    input_fault: bool = False
+
+
+@dataclass(eq=False)
+class Work:
+    """What the archives of one run share.
+
+    Parameters
+    ----------
+    settings : Settings
+        What to compute.
+    catalog : Catalog
+        Where results go.
+    run : int or str
+        Identity of the run in the catalog.
+    client : distributed.Client
+        Where batches are computed.
+    progress : Progress
+        Who is told.
+    """
+
+    settings: Settings
+    catalog: Catalog
+    run: Any
+    client: Client
+    progress: Progress
+    _matrices: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    _lock: Lock = field(default_factory=Lock)
+
+    def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
+        """Response matrix, computed once for all archives of one geometry."""
+        with self._lock:
+            digest = str(plan.response_key)
+            found = self._matrices.get(digest)
+            if found is None:
+                found = self.catalog.scratch.load_arrays("response", digest, "matrix").get("M")
+            if found is None:
+                parameters = self.settings.configuration.response
+                found = response.response_matrix(
+                    plan.geometry,
+                    plan.grid,
+                    plan.spectrum,
+                    plan.sources,
+                    sampling=parameters.sampling,
+                    slope_response=parameters.slope_response,
+                )
+                self.catalog.scratch.save_arrays("response", digest, "matrix", {"M": found})
+            self._matrices[digest] = found
+            return found
+
+
+def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
+    """What turns correlations of this archive into profiles."""
+    return stages.Model(
+        geometry=plan.geometry,
+        grid=plan.grid,
+        matrix=work.matrix(plan),
+        regulariser=plan.regulariser,
+        selector=plan.selector,
+        inversion=work.settings.configuration.inversion,
+    )
+
+
+def process_archive(url: str, work: Work) -> ArchiveOutcome:
+    """Process one archive; never raises for what is wrong with it."""
+    name = safe(url)
+    try:
+        plan = plan_archive(url, work.settings)
+        name = plan.name
+        outcome = _process(plan, work)
+    except (ArchiveError, InputError, PluginError) as error:
+        outcome = ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
+    except Exception as error:
+        # Whatever else goes wrong with one archive must not take the others down.
+        log.debug("archive %s failed", url, exc_info=True)
+        reason = f"{name}: {type(error).__name__}: {safe(str(error))}"
+        outcome = ArchiveOutcome(url, name, "failed", faults=(reason,))
+    if outcome.status in ("refused", "failed"):
+        for fault in outcome.faults:
+            work.catalog.record_failure(work.run, archive=url, batch=None, reason=fault)
+    work.progress.finished(outcome)
+    return outcome
+
+
+def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
+    catalog, digest = work.catalog, str(plan.profile_key)
+    if (present := catalog.has(plan.archive.identity, digest)) is not None:
+        return ArchiveOutcome(plan.url, plan.name, "present", batches=len(plan.windows), product=str(present))
+    remember(plan.archive)
+    done: dict[int, BatchResult] = {}
+    for window in plan.windows:
+        if (kept := catalog.scratch.load(digest, str(window.start_time))) is not None:
+            done[window.index] = kept
+    reused = len(done)
+    todo = [window for window in plan.windows if window.index not in done]
+    work.progress.planned(plan.name, len(todo))
+    frames_read = 0
+    for window, outcome in _compute(plan, todo, work):
+        frames_read += outcome.frames_read
+        if outcome.reduced is not None:
+            catalog.scratch.save_arrays(
+                "correlation", str(plan.reduction_key), str(window.start_time), as_stored(outcome.reduced)
+            )
+        catalog.scratch.save(digest, str(window.start_time), outcome.result)
+        done[window.index] = outcome.result
+        work.progress.advanced(plan.name, window.index, outcome.result.reason)
+
+    results = [done[window.index] for window in plan.windows]
+    faults = tuple(
+        f"{plan.name}: batch {number}: {result.reason}" for number, result in enumerate(results) if result.reason
+    )
+    if len(faults) == len(results):
+        return ArchiveOutcome(
+            plan.url, plan.name, "failed", len(results), len(faults), reused, frames_read, faults, input_fault=True
+        )
+    dataset = assemble(results, plan, work.settings)
+    product = catalog.publish(dataset, run=work.run, archive=plan.archive, lineage=plan.lineage(), url=plan.url)
+    for fault in faults:
+        catalog.record_failure(work.run, archive=plan.url, batch=None, reason=fault)
+    catalog.scratch.remove(digest)
+    return ArchiveOutcome(
+        plan.url,
+        plan.name,
+        "published",
+        len(results),
+        len(faults),
+        reused,
+        frames_read,
+        faults,
+        product=str(product),
+        input_fault=bool(faults),
+    )
+
+
+def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator[tuple[BatchWindow, BatchOutcome]]:
+    """Send batches to the workers, a few ahead, and yield them as they come back."""
+    from distributed import as_completed
+
+    if not todo:
+        return
+    settings, client = work.settings, work.client
+    model = client.scatter(model_of(plan, work), broadcast=True, hash=False)
+    threads = max(1, sum(client.nthreads().values()))
+    waiting = iter(todo)
+
+    def submit() -> Any:
+        window = next(waiting, None)
+        if window is None:
+            return None
+        stored = work.catalog.scratch.load_arrays("correlation", str(plan.reduction_key), str(window.start_time))
+        task = BatchTask(
+            url=plan.url,
+            identity=plan.archive.identity,
+            window=window,
+            header=plan.header,
+            duration=settings.configuration.batch.duration,
+            extraction=settings.configuration.extraction,
+            correlation=settings.configuration.correlation,
+            reduced=from_stored(stored) if stored else None,
+        )
+        future = client.submit(process_batch, task, model, pure=False, key=f"{plan.name}-{window.index}-{id(task):x}")
+        windows[future.key] = window
+        return future
+
+    windows: dict[str, BatchWindow] = {}
+    flying = as_completed()
+    for _ in range(threads * AHEAD):
+        if (future := submit()) is not None:
+            flying.add(future)
+    try:
+        for future in flying:
+            window = windows.pop(future.key)
+            try:
+                outcome = future.result()
+            except Exception as error:
+                reason = f"{type(error).__name__}: {safe(str(error))}"
+                log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
+                outcome = BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0)
+            future.release()
+            if (following := submit()) is not None:
+                flying.add(following)
+            yield window, outcome
+    finally:
+        for future in list(flying.futures):
+            future.cancel()
+
+
+def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[ArchiveOutcome]]) -> list[ArchiveOutcome]:
+    """Process archives, several at once, and keep the record of the run.
+
+    Parameters
+    ----------
+    work : Work
+        What they share.
+    archives : iterable of str
+        Paths and URLs.
+    fan_out : callable
+        Calls a function for each of a list and returns the results: threads here, tasks under Prefect.
+
+    Returns
+    -------
+    list of ArchiveOutcome
+        In the order of `archives`.
+    """
+    state = "interrupted"
+    try:
+        outcomes = fan_out(process_archive, list(archives), work)
+        state = "done" if all(outcome.status in ("published", "present") for outcome in outcomes) else "incomplete"
+        return outcomes
+    finally:
+        work.catalog.finish_run(work.run, state)
+
+
+def in_threads(process: Callable[[str, Work], ArchiveOutcome], archives: list[str], work: Work) -> list[ArchiveOutcome]:
+    """Process archives in a few threads; the work itself is done by Dask."""
+    with ThreadPoolExecutor(work.settings.run.archives_at_once, thread_name_prefix="archive") as pool:
+        futures = [pool.submit(process, url, work) for url in archives]
+        try:
+            pending = set(futures)
+            while pending:
+                # Short waits, so that an interrupt is noticed at once.
+                _, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return [future.result() for future in futures]

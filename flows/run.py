@@ -1,0 +1,78 @@
+"""A run: the catalog opened, the cluster connected, the run recorded, and its end told."""
+
+from __future__ import annotations
+
+import platform
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from .cluster import connect
+from .driver import ArchiveOutcome, Progress, Work, execute, in_threads
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from .settings import Settings
+
+
+class Silent:
+    """Progress that nobody watches."""
+
+    def planned(self, archive: str, batches: int) -> None:
+        """Nothing."""
+
+    def advanced(self, archive: str, index: int, reason: str) -> None:
+        """Nothing."""
+
+    def finished(self, outcome: ArchiveOutcome) -> None:
+        """Nothing."""
+
+
+@contextmanager
+def session(settings: Settings, progress: Progress | None = None) -> Iterator[Work]:
+    """Open what the archives of one run share, and close it in any case.
+
+    Parameters
+    ----------
+    settings : Settings
+        What to compute, and where.
+    progress : Progress, optional
+        Who is told.
+
+    Yields
+    ------
+    Work
+    """
+    from ..catalog.store import Catalog
+
+    with connect(settings.run) as client, Catalog.open(settings.output) as catalog:
+        run = catalog.start_run(campaign=settings.campaign, host=platform.node())
+        yield Work(settings, catalog, run, client, progress or Silent())
+
+
+def run(settings: Settings, progress: Progress | None = None, *, prefect: bool = True) -> list[ArchiveOutcome]:
+    """Process every archive of the settings.
+
+    Parameters
+    ----------
+    settings : Settings
+        From :func:`coslidar.flows.settings.load`.
+    progress : Progress, optional
+        Who is told how far it is.
+    prefect : bool
+        As a Prefect flow, or as a bare loop; the results are the same bytes.
+
+    Returns
+    -------
+    list of ArchiveOutcome
+        In the order of the archives.
+    """
+    if prefect:
+        from .server import server
+
+        with server():
+            from .campaign import run_with_prefect
+
+            return run_with_prefect(settings, progress or Silent())
+    with session(settings, progress) as work:
+        return execute(work, settings.archives, in_threads)

@@ -1,0 +1,54 @@
+"""Fixtures that every suite shares."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+# Before numpy: the suite runs several processes on few cores.
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(name, "1")
+
+import coslidar.pipeline
+import pytest
+from hypothesis import HealthCheck, settings
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED = ROOT.parent / "shared"
+
+settings.register_profile(
+    "coslidar", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], print_blob=True
+)
+settings.load_profile("coslidar")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Refuse to test an installed copy instead of this checkout."""
+    found = Path(coslidar.pipeline.__file__).resolve().parent
+    if found != ROOT / "pipeline":
+        raise pytest.UsageError(f"coslidar is imported from {found}, not from {ROOT}; run: pip install -e {ROOT}")
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of recordings that are no part of the distribution."""
+    folder = SHARED / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no {folder}: this test needs recordings that are not part of the distribution")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared_sample(shared_data: Path) -> Path:
+    """The wave-optics recording."""
+    path = shared_data / "lannemezan-sample.zarr.zip"
+    if not path.is_file():
+        pytest.skip(f"no {path}")
+    return path
+
+
+@pytest.fixture(scope="session")
+def shared_truth(shared_data: Path) -> dict[str, object]:
+    """The truth of the wave-optics recording."""
+    return json.loads((shared_data / "lannemezan-sample.truth.json").read_text())
