@@ -1,0 +1,483 @@
+"""Figures of one batch: profile, correlation maps, criterion, averaging kernels.
+
+Each `draw_…` function draws into axes that the caller made and returns them, each `compose_…` lays out a whole figure
+of the report, and each `describe_…` says in words what the figure shows.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...pipeline.geometry import MAP_KINDS
+from .reading import Floats, Maps, edges, log_mu, maps, of_batch, scalar
+from .style import BLUE, DIVERGING, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
+from .words import measured, number, scientific
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+    from xarray import Dataset
+
+#: Titles of the correlation maps.
+KIND_TITLES = {
+    "xx_auto": "x slopes\none source",
+    "yy_auto": "y slopes\none source",
+    "xx_cross": "x slopes\ntwo sources",
+    "yy_cross": "y slopes\ntwo sources",
+    "ii_auto": "scintillation\none source",
+    "ii_cross": "scintillation\ntwo sources",
+}
+#: Residuals beyond this many of their errors carry a sign in the map.
+NOTABLE = 3.0
+_LEGEND = ("retrieved", "MAP bar", "maximum-likelihood bar", "bar goes on", "upper limit")
+#: rad^2 are shown as µrad^2.
+_MICRO = 1e12
+
+
+def _note(ax: Axes, text: str) -> Axes:
+    ax.text(0.5, 0.5, text, ha="center", va="center", color=MUTED, transform=ax.transAxes)
+    ax.set_xticks([])
+    ax.set_yticks([])
+    return ax
+
+
+def _plain(value: float, _: int | None = None) -> str:
+    return f"{value:.6g}".replace("-", "−")
+
+
+def _ticks(axis: Axis, lags: Floats) -> None:
+    """Mark zero and a round number on either side, well inside so that labels of neighbouring maps keep apart."""
+    reach = 0.8 * float(np.abs(lags).max())
+    if reach > 0:
+        decade = 10.0 ** np.floor(np.log10(reach))
+        step = max(factor * decade for factor in (1, 2, 3, 5) if factor * decade <= reach)
+        axis.set_ticks([-step, 0.0, step])
+    else:
+        axis.set_ticks([0.0])
+    axis.set_major_formatter(_plain)
+    axis.set_tick_params(labelsize=11)
+
+
+def _limits(dataset: Dataset, batch: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, Floats, Floats]:
+    """MAP bars, ML bars, whether the bound is active, and the upper limit there."""
+    blank = np.full(shape, np.nan)
+    cn2 = of_batch(dataset, "cn2", batch)
+    error = of_batch(dataset, "cn2_standard_error", batch)
+    error_ml = of_batch(dataset, "cn2_standard_error_ml", batch)
+    bound = of_batch(dataset, "cn2_at_bound", batch)
+    interval = of_batch(dataset, "cn2_interval_95", batch)
+    cn2 = blank if cn2 is None else cn2
+    error = blank if error is None else error
+    active = np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0
+    upper = interval[..., 1] if interval is not None else cn2 + 2 * error
+    return error, blank if error_ml is None else error_ml, active, np.where(active, upper, np.nan)
+
+
+def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
+    """Draw the profile of a batch: slices as steps, MAP and ML bars, upper limits where the bound is active.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    dataset : Dataset
+        A product.
+    batch : int
+        Number of the batch in the product.
+
+    Returns
+    -------
+    Axes
+        `ax`.
+    """
+    cn2 = of_batch(dataset, "cn2", batch)
+    if cn2 is None or not np.isfinite(cn2).any():
+        return _note(ax, "no profile")
+    border = edges(dataset)
+    centre, width = (border[1:] + border[:-1]) / 2, np.diff(border)
+    error, error_ml, active, limit = _limits(dataset, batch, cn2.shape)
+    shown = np.isfinite(cn2) & (cn2 > 0) & ~active
+
+    seen = np.concatenate([cn2[shown], (cn2 + error)[shown], limit])
+    seen = seen[np.isfinite(seen) & (seen > 0)]
+    if not seen.size:
+        return _note(ax, "every slice is at the bound")
+    top = 1.6 * seen.max()
+    bottom = max(min([*cn2[shown], *limit[np.isfinite(limit) & (limit > 0)]]) / 3, top / 1e5)
+    ax.set_yscale("log")
+    ax.set_ylim(bottom, top)
+    ax.set_xlim(border[0], border[-1])
+
+    steps = np.where(shown, cn2, np.nan)
+    ax.stairs(np.where(shown, cn2, bottom), border, baseline=bottom, fill=True, color=BLUE, alpha=0.13, lw=0)
+    ax.stairs(steps, border, baseline=None, color=BLUE, lw=2.2, label="retrieved")
+
+    def bars(at: Floats, bar: Floats, where: np.ndarray, **style: object) -> None:
+        # On a logarithmic axis a bar that reaches below zero ends under the axis, not nowhere.
+        here = where & np.isfinite(bar) & (bar > 0)
+        low = np.minimum(bar, cn2 - np.minimum(cn2, bottom) / 2)
+        ax.errorbar(at[here], cn2[here], yerr=np.stack([low, bar])[:, here], **style)  # type: ignore[arg-type]
+
+    bars(centre - 0.14 * width, error, shown, fmt="o", color=BLUE, mfc=BLUE, ms=6, capsize=4, lw=2, label="MAP bar")
+    bars(centre + 0.14 * width, error_ml, shown & (error_ml < 1e3 * top), fmt="D", color=RED, mfc=PAPER, ms=5.5,
+         capsize=4, lw=1.2, label="maximum-likelihood bar")  # fmt: skip
+    beyond = shown & ~np.isnan(error_ml) & (cn2 + error_ml > top)
+    if beyond.any():
+        ax.plot((centre + 0.14 * width)[beyond], np.full(beyond.sum(), 0.985), "^", color=RED, mfc=PAPER, ms=7,
+                transform=ax.get_xaxis_transform(), clip_on=False, label="bar goes on")  # fmt: skip
+    arrows = active & np.isfinite(limit) & (limit > bottom)
+    if arrows.any():
+        x, high = centre[arrows], limit[arrows]
+        low = np.maximum(0.45 * high, 1.1 * bottom)
+        ax.hlines(high, x - 0.4 * width[arrows], x + 0.4 * width[arrows], color=PURPLE, lw=2.2)
+        ax.vlines(x, low, high, color=PURPLE, lw=2.2)
+        ax.plot(x, low, "v", color=PURPLE, ms=9, label="upper limit")
+    ax.set_xlabel("distance from the pupil z (m)")
+    ax.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
+    ax.grid(axis="y", which="major")
+    handles, labels = ax.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda i: _LEGEND.index(labels[i]))
+    ax.legend([handles[i] for i in order], [labels[i] for i in order], loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncol=5,
+              columnspacing=1.4, handletextpad=0.5)  # fmt: skip
+    return ax
+
+
+def compose_profile(figure: Figure, dataset: Dataset, batch: int) -> None:
+    """Lay out the figure of the profile."""
+    draw_profile(figure.add_axes((0.105, 0.155, 0.88, 0.73)), dataset, batch)
+
+
+def describe_profile(dataset: Dataset, batch: int) -> str:
+    """Say what the profile of a batch shows."""
+    cn2 = of_batch(dataset, "cn2", batch)
+    if cn2 is None or not np.isfinite(cn2).any():
+        return "This batch has no profile."
+    border = edges(dataset)
+    error, _, active, _ = _limits(dataset, batch, cn2.shape)
+    peak = int(np.nanargmax(cn2))
+    text = (
+        f"Cn2 in {cn2.size} slices from {number(border[0], 4)} to {number(border[-1], 4)} m. The strongest slice, "
+        f"{number(border[peak], 4)} to {number(border[peak + 1], 4)} m, holds {measured(cn2[peak], error[peak])} m^(-2/3)."
+    )
+    count = int(active.sum())
+    return text + (f" {count} of the slices {'is' if count == 1 else 'are'} at the bound of zero." if count else "")
+
+
+def draw_correlation_map(
+    ax: Axes, dataset: Dataset, values: Floats, *, norm: Normalize, residual: bool = False, ticks: bool = True
+) -> AxesImage:
+    """Draw one correlation map, dy upward.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    dataset : Dataset
+        The product, for its separations.
+    values : ndarray of float64, (dy, dx)
+        The map; NaN is left blank.
+    norm : Normalize
+        Scale, common to the maps that are compared.
+    residual : bool
+        Use the diverging colour map, and put a sign where :data:`NOTABLE` is exceeded.
+    ticks : bool
+        Mark separations, in cm, on both axes.
+
+    Returns
+    -------
+    AxesImage
+        The image, for a colour bar.
+    """
+    dy, dx = (np.asarray(dataset[name].values, dtype=np.float64) * 100 for name in ("dy", "dx"))
+    half_y, half_x = ((axis[1] - axis[0]) / 2 if axis.size > 1 else 0.5 for axis in (dy, dx))
+    image = ax.imshow(
+        np.ma.masked_invalid(values), origin="lower", interpolation="none", norm=norm, aspect="equal",
+        cmap=DIVERGING if residual else SEQUENTIAL,
+        extent=(dx[0] - half_x, dx[-1] + half_x, dy[0] - half_y, dy[-1] + half_y),
+    )  # fmt: skip
+    if residual:
+        for sign, marker in ((1, "+"), (-1, "_")):
+            rows, columns = np.nonzero(np.nan_to_num(sign * values) > NOTABLE)
+            ax.plot(dx[columns], dy[rows], marker, color=PAPER, ms=5, mew=1.3, ls="none")
+    if ticks:
+        _ticks(ax.xaxis, dx)
+        _ticks(ax.yaxis, dy)
+    else:
+        ax.set_xticks([])
+        ax.set_yticks([])
+    ax.spines[["right", "top"]].set_visible(True)
+    return image
+
+
+def draw_correlation_cut(ax: Axes, dataset: Dataset, item: Maps) -> Axes:
+    """Draw measured and modelled correlation along dy at dx = 0."""
+    dy = np.asarray(dataset["dy"].values, dtype=np.float64) * 100
+    middle = item.measured.shape[1] // 2
+    unit = _MICRO if item.is_slope else 1.0
+    ax.axhline(0, color=MUTED, lw=0.8)
+    ax.plot(dy, item.model[:, middle] * unit, color=BLUE, lw=1.6, label="model")
+    error = np.nan_to_num(item.error[:, middle]) * unit
+    ax.errorbar(dy, item.measured[:, middle] * unit, yerr=error, fmt="o", color=RED, mfc=PAPER, ms=4.2, lw=1.2,
+                label="measured")  # fmt: skip
+    _ticks(ax.xaxis, dy)
+    ax.tick_params(labelsize=11)
+    return ax
+
+
+def _range(items: list[Maps], unit: float) -> tuple[float, float]:
+    # A batch without a model (or without finite values) still has a measured scale.
+    stack = np.concatenate([np.ravel(values) for item in items for values in (item.measured, item.model)]) * unit
+    finite = stack[np.isfinite(stack)]
+    low, high = float(finite.min()), float(finite.max())
+    return min(low, 0.0), high if high > min(low, 0.0) else min(low, 0.0) + 1.0
+
+
+#: Width and usual height of the figure of the correlation maps, inches.
+CORRELATION_SIZE = (10.0, 6.9)
+_CUT = 1.25
+
+
+def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
+    """Lay out measured, modelled and residual maps and their cut, one column per kind, on common scales.
+
+    The height of the figure follows from the number of kinds: with fewer of them the maps are larger.
+    """
+    from matplotlib.colors import Normalize
+
+    items = maps(dataset, batch)
+    if not items:
+        _note(figure.add_axes((0.1, 0.1, 0.8, 0.8)), "no correlation maps")
+        return
+    groups = [group for group in ([i for i in items if i.is_slope], [i for i in items if not i.is_slope]) if group]
+    width, left, gap, bar = CORRELATION_SIZE[0], 0.86, 0.12, 0.85
+    cell = min(1.6, (width - left - bar * len(groups) - gap * (len(items) - len(groups))) / len(items))
+    rows = {"cut": 0.55, "residual": 0.55 + _CUT + 0.92}
+    rows["model"] = rows["residual"] + cell + 0.36
+    rows["measured"] = rows["model"] + cell + 0.14
+    height = rows["measured"] + cell + 0.52
+    figure.set_size_inches(width, height)
+    worst = max((float(np.nanmax(np.abs(i.residual))) for i in items if np.isfinite(i.residual).any()), default=NOTABLE)
+    spread = float(np.clip(np.ceil(worst), NOTABLE, 6.0))
+    sigma = Normalize(-spread, spread)
+    lags = {name: np.asarray(dataset[name].values, dtype=np.float64) * 100 for name in ("dx", "dy")}
+
+    def axes(x: float, y: float, w: float, h: float) -> Axes:
+        return figure.add_axes((x / width, y / height, w / width, h / height))
+
+    def scale(image: AxesImage, x: float, low: float, high: float, label: str, extend: str = "neither") -> None:
+        drawn = figure.colorbar(image, cax=axes(x, low, 0.13, high - low), extend=extend)
+        drawn.outline.set_linewidth(0.6)  # type: ignore[operator]
+        drawn.ax.yaxis.set_major_formatter(_plain)
+        drawn.ax.tick_params(labelsize=11)
+        drawn.ax.set_title(label, fontsize=11, loc="left", pad=7)
+
+    for name, y in rows.items():
+        text, size = ("at dx = 0", _CUT) if name == "cut" else (name, cell)
+        figure.text(0.012, (y + size / 2) / height, text, rotation=90, va="center", ha="center", weight="bold", fontsize=13)
+    x = left
+    for group in groups:
+        unit, words = (_MICRO, "µrad²") if group[0].is_slope else (1.0, "index")
+        low, high = _range(group, unit)
+        norm = Normalize(low, high)
+        for item in group:
+            edge = x == left
+            for name in ("measured", "model", "residual"):
+                ax = axes(x, rows[name], cell, cell)
+                residual = name == "residual"
+                values = item.residual if residual else getattr(item, name) * unit
+                image = draw_correlation_map(ax, dataset, values, norm=sigma if residual else norm, residual=residual,
+                                             ticks=False)  # fmt: skip
+                if name == "measured":
+                    ax.set_title(KIND_TITLES[item.kind], fontsize=12, loc="center")
+                if residual:
+                    _ticks(ax.xaxis, lags["dx"])
+                    ax.set_xlabel("dx (cm)", labelpad=1)
+                    if np.isfinite(item.rms):
+                        ax.set_title(f"rms {number(item.rms, 3)}", fontsize=12, loc="center", pad=4)
+                if edge:
+                    _ticks(ax.yaxis, lags["dy"])
+                    ax.set_ylabel("dy (cm)", labelpad=0)
+                if item is group[-1] and name == "measured":
+                    scale(image, x + cell + 0.1, rows["model"], rows["measured"] + cell, words)
+                if item is group[-1] and residual:
+                    extend = "both" if worst > spread else "neither"
+                    scale(image, x + cell + 0.1, rows[name], rows[name] + cell, "errors", extend)
+            cut = draw_correlation_cut(axes(x, rows["cut"], cell, _CUT), dataset, item)
+            cut.set_xlabel("dy (cm)", labelpad=1)
+            cut.set_ylim(low - 0.06 * (high - low), high + 0.08 * (high - low))
+            cut.yaxis.set_major_formatter(_plain)
+            if item is not group[0]:
+                cut.set_yticks([])
+            elif edge:
+                cut.set_ylabel(words, labelpad=2)
+                cut.legend(loc="lower left", bbox_to_anchor=(-0.12, 0.97), ncol=2, fontsize=11, borderpad=0.2)
+            x += cell + gap
+        x += bar - gap
+
+
+def describe_correlations(dataset: Dataset, batch: int) -> str:
+    """Say how well the model follows the measured maps of a batch."""
+    items = maps(dataset, batch)
+    if not items:
+        return "This batch has no correlation maps."
+    parts = []
+    for item in items:
+        unit, word = (_MICRO, " µrad²") if item.is_slope else (1.0, "")
+        peak = number(float(np.nanmax(item.measured)) * unit, 3)
+        title = KIND_TITLES[item.kind].replace("\n", ", ")
+        parts.append(f"{title}: up to {peak}{word}, residual rms {number(item.rms, 3)} errors")
+    missing = len(MAP_KINDS) - len(items)
+    alone = " There are no maps between sources: one source was observed." if missing and not any(
+        "cross" in item.kind for item in items
+    ) else ""  # fmt: skip
+    return "; ".join(parts) + "." + alone
+
+
+def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
+    """Draw the criterion of a batch against log10(mu) with the chosen value marked."""
+    grid = of_batch(dataset, "log_mu_grid", batch)
+    curve = of_batch(dataset, "criterion", batch)
+    chosen = log_mu(scalar(dataset, "mu", batch))
+    ax.set_xlabel(r"$\log_{10}\,\mu$   ($\mu$ in m$^{4/3}$)")
+    if grid is None or curve is None or not np.isfinite(curve).any():
+        _note(ax, "no criterion: μ was given")
+        return ax
+    finite = np.isfinite(curve)
+    lowest = curve[finite].min()
+    ratio = lowest > 0
+    shown = curve / lowest if ratio else curve - lowest
+    ax.plot(grid, shown, "-", color=BLUE, marker=".", ms=6)
+    ax.set_ylabel("criterion / its minimum" if ratio else "criterion − its minimum")
+    if ratio and np.nanmax(shown[finite]) > 20:
+        from matplotlib.ticker import LogFormatter, NullFormatter
+
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter(LogFormatter())
+        ax.yaxis.set_minor_formatter(NullFormatter())
+    if np.isfinite(chosen):
+        ax.axvline(chosen, color=RED, lw=1.6, ls=(0, (5, 3)))
+        level = np.interp(chosen, grid[finite], shown[finite])
+        ax.plot([chosen], [level], "D", color=RED, mfc=PAPER, ms=8, mew=1.8)
+        right = chosen > (grid[0] + grid[-1]) / 2
+        ax.annotate(
+            f"chosen: {number(chosen, 4)}", (chosen, 0.93), xycoords=("data", "axes fraction"), color=RED,
+            xytext=(-8 if right else 8, 0), textcoords="offset points", ha="right" if right else "left",
+        )  # fmt: skip
+    ax.grid(axis="y")
+    return ax
+
+
+def compose_criterion(figure: Figure, dataset: Dataset, batch: int) -> None:
+    """Lay out the figure of the criterion."""
+    draw_criterion(figure.add_axes((0.105, 0.19, 0.88, 0.77)), dataset, batch)
+
+
+def describe_criterion(dataset: Dataset, batch: int) -> str:
+    """Say which mu was chosen and how sharp the criterion is there."""
+    grid = of_batch(dataset, "log_mu_grid", batch)
+    curve = of_batch(dataset, "criterion", batch)
+    chosen = log_mu(scalar(dataset, "mu", batch))
+    if grid is None or curve is None or not np.isfinite(curve).any():
+        return f"There is no criterion curve; log10(mu) is {number(chosen, 4)}."
+    least = float(grid[np.nanargmin(curve)])
+    return (
+        f"Criterion for log10(mu) from {number(float(grid[0]), 4)} to {number(float(grid[-1]), 4)}. Its minimum on the grid is at "
+        f"{number(least, 4)}; the chosen value is {number(chosen, 4)}."
+    )
+
+
+def draw_averaging_kernels(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
+    """Draw the averaging kernels of a batch as a matrix: a row per retrieved slice, a column per true slice."""
+    kernel = of_batch(dataset, "averaging_kernel", batch)
+    if kernel is None or not np.isfinite(kernel).any():
+        return _note(ax, "no averaging kernels")
+    from .reading import borders
+
+    rows = edges(dataset)
+    columns = rows if kernel.shape[0] == kernel.shape[1] else borders(np.asarray(dataset["z_true"].values, float))
+    limit = float(np.nanmax(np.abs(kernel))) or 1.0
+    if all(np.allclose(np.diff(border), border[1] - border[0]) for border in (rows, columns)):
+        image = ax.imshow(np.ma.masked_invalid(kernel), origin="lower", interpolation="none", aspect="auto", cmap=DIVERGING,
+                          vmin=-limit, vmax=limit, extent=(columns[0], columns[-1], rows[0], rows[-1]))  # fmt: skip
+    else:
+        image = ax.pcolormesh(columns, rows, np.ma.masked_invalid(kernel), cmap=DIVERGING, vmin=-limit, vmax=limit,
+                              rasterized=True)  # type: ignore[assignment] # fmt: skip
+    ends = [max(rows[0], columns[0]), min(rows[-1], columns[-1])]
+    ax.plot(ends, ends, color=INK, lw=1, ls=":")
+    ax.set_xlabel("true distance z (m)")
+    ax.set_ylabel("retrieved distance z (m)")
+    scale = ax.figure.colorbar(image, ax=ax, fraction=0.05, pad=0.03)  # type: ignore[union-attr]
+    scale.outline.set_linewidth(0.6)
+    scale.ax.set_title("response", fontsize=12, loc="left", pad=8)
+    scale.ax.yaxis.set_major_formatter(_plain)
+    return ax
+
+
+def draw_kernel_sums(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
+    """Draw diagonal and sum of each averaging kernel against the distance of its slice."""
+    kernel = of_batch(dataset, "averaging_kernel", batch)
+    if kernel is None or not np.isfinite(kernel).any():
+        return _note(ax, "")
+    border = edges(dataset)
+    centre = (border[1:] + border[:-1]) / 2
+    ax.axvline(1, color=MUTED, lw=1)
+    ax.axvline(0, color=MUTED, lw=1)
+    ax.plot(kernel.sum(axis=1), centre, "o-", color=BLUE, label="sum")
+    if kernel.shape[0] == kernel.shape[1]:
+        ax.plot(np.diag(kernel), centre, "s--", color=RED, mfc=PAPER, label="own slice")
+    ax.set_ylim(border[0], border[-1])
+    ax.xaxis.set_major_formatter(_plain)
+    ax.set_xlabel("response")
+    ax.legend(loc="lower left", bbox_to_anchor=(-0.04, 1.0), ncol=2, columnspacing=1.0, handletextpad=0.4)
+    return ax
+
+
+def compose_kernels(figure: Figure, dataset: Dataset, batch: int) -> None:
+    """Lay out the averaging kernels and their sums."""
+    draw_averaging_kernels(figure.add_axes((0.105, 0.13, 0.575, 0.78)), dataset, batch)
+    sums = draw_kernel_sums(figure.add_axes((0.765, 0.13, 0.22, 0.78)), dataset, batch)
+    sums.set_yticklabels([])
+
+
+def describe_kernels(dataset: Dataset, batch: int) -> str:
+    """Say how many slices the data determine."""
+    kernel = of_batch(dataset, "averaging_kernel", batch)
+    if kernel is None or not np.isfinite(kernel).any():
+        return "This batch has no averaging kernels."
+    freedom = scalar(dataset, "degrees_of_freedom", batch)
+    text = f"{number(freedom, 3)} degrees of freedom for {kernel.shape[0]} slices. " if np.isfinite(freedom) else ""
+    if kernel.shape[0] == kernel.shape[1]:
+        border, own = edges(dataset), np.diag(kernel)
+        weak = np.flatnonzero(own < 0.5)
+        places = ", ".join(f"{number(border[i], 4)} to {number(border[i + 1], 4)} m" for i in weak)
+        text += (
+            f"Slices that answer by less than half to their own turbulence: {places}."
+            if weak.size
+            else "Every slice answers by more than half to its own turbulence."
+        )
+    return text.strip()
+
+
+def profile_rows(dataset: Dataset, batch: int) -> list[list[str]]:
+    """The profile of a batch as text: from, to, Cn2, MAP bar, ML bar, remark."""
+    cn2 = of_batch(dataset, "cn2", batch)
+    if cn2 is None:
+        return []
+    border = edges(dataset)
+    error, error_ml, active, limit = _limits(dataset, batch, cn2.shape)
+    return [
+        [
+            number(border[i], 5),
+            number(border[i + 1], 5),
+            scientific(cn2[i]),
+            scientific(error[i]),
+            scientific(error_ml[i]),
+            f"at the bound, below {scientific(limit[i])}" if active[i] else "",
+        ]
+        for i in range(cn2.size)
+    ]

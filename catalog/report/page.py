@@ -1,0 +1,467 @@
+"""One self-contained page from products: what is in it, in which order, and with which words."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import batch_panels as one
+from . import time_panels as over
+from .reading import LEVELS, bounds, flag_names, flags, has_profile, levels, listed, log_mu, of_batch, scalar, span, values
+from .style import figure_style
+from .svg import inline_svg
+from .words import NOTHING, clean, clock, days, interval, mapping, measured, number, offset, scientific, site_zone
+from ...pipeline.products import QUALITY_FLAGS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from xarray import Dataset
+
+#: The paper that describes the method.
+METHOD = (
+    "C. Sauvage, C. Robert, L. M. Mugnier, J.-M. Conan, J.-M. Cohard, K.-L. Nguyen, M. Irvine, J.-P. Lagouarde: "
+    "Near ground horizontal high resolution Cn2 profiling from Shack-Hartmann slope and scintillation data. "
+    "Applied Optics 60 (34), 10499-10519 (2021), doi:10.1364/AO.438170"
+)
+
+#: Characters of a lineage or provenance that the page shows.
+SHOWN = 60_000
+
+
+@dataclass(frozen=True)
+class BatchPanel:
+    """A figure of one batch, named after the question it answers.
+
+    Parameters
+    ----------
+    key : str
+        Name for programs.
+    title : str
+        The question.
+    reading : str
+        How to read the figure.
+    size : (float, float)
+        Width and height, inches.
+    compose : callable
+        Draws the figure of (figure, dataset, batch).
+    describe : callable
+        Says what the figure of (dataset, batch) shows.
+    """
+
+    key: str
+    title: str
+    reading: str
+    size: tuple[float, float]
+    compose: Callable[[Figure, Dataset, int], None]
+    describe: Callable[[Dataset, int], str]
+
+
+@dataclass(frozen=True)
+class TimePanel:
+    """A figure over all batches, named after the question it answers; fields as in :class:`BatchPanel`."""
+
+    key: str
+    title: str
+    reading: str
+    size: tuple[float, float]
+    compose: Callable[[Figure, Sequence[Dataset]], None]
+    describe: Callable[[Sequence[Dataset]], str]
+
+
+BATCH_PANELS = (
+    BatchPanel(
+        "profile",
+        "How does Cn² vary along the line of sight?",
+        "A step is one slice. The bar with a filled circle is the MAP error (1 sigma); the bar with an open diamond is the "
+        "maximum-likelihood error, from the data alone: where it is much longer, the prior decides. A bar with an arrow is "
+        "a slice that the positivity constraint holds at zero; it marks zero plus two MAP errors, or the upper end of the "
+        "95 % interval where the product has one.",
+        (10.0, 4.6),
+        one.compose_profile,
+        one.describe_profile,
+    ),
+    BatchPanel(
+        "correlations",
+        "Does the profile explain the measured correlations?",
+        "Each map shows a correlation against the separation of two subapertures, dx to the right and dy upward; separations "
+        "without a pair are blank. Measured and model share a scale for all slope maps, and one for both scintillation maps. "
+        "Residuals are (measured − model) in units of their error: an rms near 1 is a good fit, and a plus or minus sign marks "
+        "more than 3 errors. The last row cuts the maps at dx = 0.",
+        one.CORRELATION_SIZE,
+        one.compose_correlations,
+        one.describe_correlations,
+    ),
+    BatchPanel(
+        "criterion",
+        "How was the strength of the regularisation chosen?",
+        "The curve is the criterion for each μ; μ is the inverse of the a priori variance of the profile. The diamond on the "
+        "dashed line is the value used. A flat curve means that the data hardly tell.",
+        (10.0, 3.6),
+        one.compose_criterion,
+        one.describe_criterion,
+    ),
+    BatchPanel(
+        "kernels",
+        "Which part of the path does each slice really see?",
+        "A row tells how one retrieved slice answers to turbulence at each true distance, without the positivity constraint. Ideal: 1 on the dotted "
+        "diagonal. Right: the sum of each row (filled circles; 1 means that the data, not the prior, set the level) and the "
+        "part from the slice's own place (open squares).",
+        (10.0, 4.9),
+        one.compose_kernels,
+        one.describe_kernels,
+    ),
+)
+
+TIME_PANELS = (
+    TimePanel(
+        "map",
+        "When and where is the turbulence strong?",
+        "One column per batch, one row per slice; brighter is stronger, on a logarithmic scale taken from the data. Blank: nothing was "
+        "measured. Hatched: the positivity constraint holds the slice at zero.",
+        (10.0, 4.9),
+        over.compose_time_distance,
+        over.describe_time_distance,
+    ),
+    TimePanel(
+        "strength",
+        "Does the profile agree with what the spots show directly?",
+        "Open symbols are measured directly from fluxes and slopes, source by source; filled diamonds are computed from the "
+        "retrieved profile, with aperture and source averaging in the index. Both hold at the instrument's wavelength. Where they differ, the "
+        "profile misses or invents turbulence.",
+        (10.0, 5.6),
+        over.compose_strength,
+        over.describe_strength,
+    ),
+    TimePanel(
+        "fit",
+        "Does the model fit, and is the regularisation steady?",
+        "Above: misfit per independent datum; 1 is what the convergence noise predicts. Below: the hyperparameter μ (m^(4/3)); it rises by "
+        "2 in the logarithm when the turbulence falls by 10.",
+        (10.0, 4.8),
+        over.compose_fit,
+        over.describe_fit,
+    ),
+    TimePanel(
+        "quality",
+        "Which batches need care?",
+        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number on the right counts the batches.",
+        (10.0, 4.3),
+        over.compose_quality,
+        over.describe_quality,
+    ),
+)
+
+
+def figure(panel: BatchPanel | TimePanel, datasets: Dataset | Sequence[Dataset], batch: int = 0) -> Figure:
+    """Draw the figure of a panel, to be saved as PNG, PDF or SVG with ``figure.savefig``.
+
+    Parameters
+    ----------
+    panel : BatchPanel or TimePanel
+        One of :data:`BATCH_PANELS`, :data:`TIME_PANELS`.
+    datasets : Dataset or sequence of Dataset
+        Products; a panel of one batch takes the first.
+    batch : int
+        Number of the batch in that product.
+    """
+    from matplotlib.figure import Figure
+
+    products = listed(datasets)
+    with figure_style():
+        drawn = Figure(figsize=panel.size)
+        if isinstance(panel, BatchPanel):
+            panel.compose(drawn, products[0], batch)
+        else:
+            panel.compose(drawn, products)
+    return drawn
+
+
+def _markup(panel: BatchPanel | TimePanel, prefix: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
+    text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
+    drawn = figure(panel, products, batch)
+    with figure_style():
+        svg = inline_svg(drawn, prefix, panel.title, text)
+    return {"title": panel.title, "reading": panel.reading, "text": text, "svg": svg, "key": panel.key}
+
+
+def pick(usable: Sequence[bool] | np.ndarray, most: int) -> list[int]:
+    """Numbers of at most `most` usable batches, first and last among them, spread evenly."""
+    numbers = np.flatnonzero(np.asarray(usable))
+    if len(numbers) <= most:
+        return [int(i) for i in numbers]
+    return [int(i) for i in numbers[np.round(np.linspace(0, len(numbers) - 1, most)).astype(int)]]
+
+
+def _spread(found: Sequence[float], factor: float = 1.0) -> tuple[str, str]:
+    """A number with what is known of its variation: value, remark."""
+    finite = np.asarray([value for value in found if np.isfinite(value)]) * factor
+    if not finite.size:
+        return NOTHING, ""
+    if finite.size == 1:
+        return number(float(finite[0]), 3), ""
+    return number(float(np.median(finite)), 3), f"median; {number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}"
+
+
+def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
+    batches = [(dataset, batch) for dataset in products for batch in range(dataset.sizes["time"])]
+
+    def number_of(name: str, words: str, unit: str, factor: float = 1.0) -> dict[str, str]:
+        value, remark = _spread([scalar(dataset, name, batch) for dataset, batch in batches], factor)
+        error = f"{name}_standard_error"
+        if len(batches) == 1 and error in products[0]:
+            value = measured(factor * scalar(*batches[0][:1], name, 0), factor * scalar(products[0], error, 0))
+        return {"name": words, "value": value, "unit": unit, "remark": remark}
+
+    means, errors = zip(*(path_mean(dataset, batch) for dataset, batch in batches), strict=True)
+    value, remark = _spread(means)
+    if len(batches) == 1 and np.isfinite(means[0]):
+        value, remark = measured(means[0], errors[0]), "error: the slices' MAP bars, added as if they were one error"
+    elif np.isfinite(errors).any():
+        remark += f"; error of one batch at most {scientific(float(np.nanmedian(errors)), 2)}"
+    return [
+        {"name": "Cn², mean over the path", "value": value, "unit": "m^(-2/3)", "remark": remark},
+        number_of("r0_profile", "Fried parameter r₀, from the profile", "cm", 100),
+        *([number_of("r0_direct", "Fried parameter r₀, direct", "cm", 100)] if "r0_direct" in products[0] else []),
+        number_of("scintillation_index_profile", "scintillation index, from the profile", ""),
+        number_of("scintillation_index_direct", "scintillation index, direct", ""),
+        number_of("chi2_reduced", "χ² per datum", ""),
+        number_of("degrees_of_freedom", "degrees of freedom for signal", ""),
+    ]
+
+
+def path_mean(dataset: Dataset, batch: int) -> tuple[float, float]:
+    """Cn2 averaged over the path and the largest error that its MAP bars allow, m^(-2/3); NaN without a profile."""
+    cn2, error = of_batch(dataset, "cn2", batch), of_batch(dataset, "cn2_standard_error", batch)
+    if cn2 is None or not np.isfinite(cn2).all():
+        return float("nan"), float("nan")
+    width = np.diff(one.edges(dataset))
+    share = width / width.sum()
+    # Errors of neighbouring slices are correlated, mostly negatively, and a product holds no correlation: their plain
+    # sum is the largest that it can be.
+    return float(share @ cn2), float(share @ error) if error is not None else float("nan")
+
+
+#: Columns of the table of batches: heading, unit, tooltip.
+COLUMNS = (
+    ("start", "UTC", "start of the batch"),
+    ("length", "s", "end minus start"),
+    ("frames", "", "frames in the batch"),
+    ("quality", "", "good, usable with care, bad; and the flags raised"),
+    ("Cn² mean", "m^(-2/3)", "average of the profile over the path"),
+    ("r₀", "cm", "Fried parameter of a spherical wave, from the profile"),
+    ("σ² direct", "", "scintillation index measured directly, mean of the sources"),
+    ("σ² profile", "", "scintillation index of the profile, aperture- and source-averaged"),
+    ("σ² point", "", "scintillation index of one point of the source: first-order theory fails above 0.3"),
+    ("log₁₀ μ", "μ: m^(4/3)", "hyperparameter"),
+    ("χ²", "per datum", "misfit"),
+    ("d.o.f.", "", "degrees of freedom for signal"),
+    ("measured", "%", "spots that could be measured"),
+)
+
+
+def _cell(value: float, digits: int = 4) -> dict[str, str]:
+    return {"text": number(value, digits), "sort": repr(float(value)) if np.isfinite(value) else ""}
+
+
+def _table(products: Sequence[Dataset]) -> list[dict[str, Any]]:
+    rows = []
+    for dataset in products:
+        limit, level, raised = bounds(dataset), levels(dataset), flags(dataset)
+        for batch in range(dataset.sizes["time"]):
+            start, stop = (int(time) for time in limit[batch])
+            names = flag_names(int(raised[batch]))
+            cells = [
+                {"text": clock(start), "sort": str(start)},
+                _cell((stop - start) / 1e9),
+                {"text": f"{frames:.0f}" if np.isfinite(frames := scalar(dataset, "n_frames", batch)) else NOTHING,
+                 "sort": repr(frames) if np.isfinite(frames) else ""},
+                {"text": LEVELS[level[batch]] + (f": {', '.join(names)}" if names else ""), "sort": str(level[batch])},
+                _cell(path_mean(dataset, batch)[0]),
+                _cell(100 * scalar(dataset, "r0_profile", batch)),
+                _cell(scalar(dataset, "scintillation_index_direct", batch)),
+                _cell(scalar(dataset, "scintillation_index_profile", batch)),
+                _cell(scalar(dataset, "scintillation_index_point", batch)),
+                _cell(log_mu(scalar(dataset, "mu", batch))),
+                _cell(scalar(dataset, "chi2_reduced", batch)),
+                _cell(scalar(dataset, "degrees_of_freedom", batch)),
+                _cell(100 * scalar(dataset, "valid_fraction", batch)),
+            ]  # fmt: skip
+            rows.append({"level": int(level[batch]), "cells": cells})
+    return rows
+
+
+def _pretty(value: object) -> str:
+    decoded = mapping(value)
+    text = json.dumps(decoded, indent=2, sort_keys=True, default=str, ensure_ascii=False) if decoded else str(value)
+    return text if len(text) <= SHOWN else text[:SHOWN] + f"\n… {len(text) - SHOWN} characters more in the product"
+
+
+def _attributes(dataset: Dataset) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
+    """Global attributes: short ones, and documents."""
+    short, long = [], []
+    for name, value in dataset.attrs.items():
+        text = _pretty(value)
+        (long if len(text) > 120 or "\n" in text else short).append((str(name), text))
+    return short, long
+
+
+def _policy(*contents: str) -> list[str]:
+    return [
+        "'sha256-" + base64.b64encode(hashlib.sha256(content.encode()).digest()).decode() + "'" for content in contents
+    ]
+
+
+def render(
+    datasets: Dataset | Iterable[Dataset], *, title: str | None = None, most_batches: int = 12
+) -> str:
+    """Make the report of one or more products as one self-contained HTML page.
+
+    Parameters
+    ----------
+    datasets : Dataset or iterable of Dataset
+        Products of one campaign, in any order.
+    title : str, optional
+        Heading; by default the campaign.
+    most_batches : int
+        Batches with figures of their own, picked evenly among those that have a profile.
+
+    Returns
+    -------
+    str
+        HTML. The same products give the same text.
+
+    Raises
+    ------
+    ValueError
+        There is no batch in the products.
+    """
+    from jinja2 import Environment, StrictUndefined
+    from markupsafe import Markup, escape
+
+    products = listed(datasets)
+    if not products:
+        raise ValueError("there is no batch to report on: every product is empty, or none was given")
+    for dataset in products:
+        # Lazily loaded variables would be read once per panel.
+        dataset.load()
+    source = {name: files(__package__).joinpath(name).read_text("utf-8") for name in ("report.html", "report.css", "report.js")}
+    source = {name: text.replace("\r\n", "\n") for name, text in source.items()}
+
+    start, stop = span(products)
+    zone = site_zone(products[0].attrs)
+    campaigns = list(dict.fromkeys(str(dataset.attrs.get("campaign", "unnamed campaign")) for dataset in products))
+    archives = list(dict.fromkeys(str(dataset.attrs.get("archive", "unnamed archive")) for dataset in products))
+    level = np.concatenate([levels(dataset) for dataset in products])
+    raised = int(np.bitwise_or.reduce(np.concatenate([flags(dataset) for dataset in products])))
+
+    batches = [(i, j) for i, dataset in enumerate(products) for j in range(dataset.sizes["time"])]
+    chosen = [batches[n] for n in pick(np.concatenate([has_profile(dataset) for dataset in products]), most_batches)]
+    shown = []
+    for n, (i, j) in enumerate(chosen):
+        begin, end = (int(time) for time in bounds(products[i])[j])
+        shown.append({
+            "label": f"{interval(begin, end)} UTC",
+            "quality": LEVELS[levels(products[i])[j]],
+            "flags": flag_names(int(flags(products[i])[j])),
+            "panels": [_markup(panel, f"b{n}{panel.key[:2]}", [products[i]], j) for panel in BATCH_PANELS],
+            "rows": one.profile_rows(products[i], j),
+        })  # fmt: skip
+
+    several = len(batches) > 1
+    panels = [
+        _markup(panel, f"t{panel.key[:2]}", products)
+        for panel in TIME_PANELS
+        if panel.key != "map" or (several and any(has_profile(dataset).any() for dataset in products))
+    ]
+    identities = [
+        {"archive": str(dataset.attrs.get("archive", "unnamed archive")), "key": str(dataset.attrs.get("lineage_key", ""))}
+        for dataset in products
+    ]
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        # Markup is what this package wrote itself; everything else may come from the header of somebody's archive.
+        finalize=lambda value: value if isinstance(value, Markup) else clean(value),
+    )  # fmt: skip
+
+    def raised_units(text: str) -> Markup:
+        """Exponents written as ``m^(-2/3)`` set higher, everything else escaped."""
+        return Markup(re.sub(r"\^\(([-0-9/]+)\)", r"<sup>\1</sup>", str(escape(clean(text)))).replace("<sup>-", "<sup>−"))
+
+    environment.filters["units"] = raised_units
+
+    def marked(items: list[dict[str, str]]) -> list[dict[str, Any]]:
+        return [{**item, "svg": Markup(item["svg"])} for item in items]
+
+    for item in shown:
+        item["panels"] = marked(item["panels"])  # type: ignore[arg-type]
+    script_policy, style_policy = _policy(source["report.js"], source["report.css"])
+    heading = title if title is not None else f"Cn² along the line of sight: {', '.join(campaigns)}"
+    return environment.from_string(source["report.html"]).render(
+        script=Markup(source["report.js"]),
+        style=Markup(source["report.css"]),
+        script_policy=Markup(script_policy),
+        style_policy=Markup(style_policy),
+        title=heading,
+        campaigns=campaigns,
+        archives=archives,
+        utc=interval(start, stop),
+        local=None if zone is None else interval(start, stop, zone),
+        zone=None if zone is None else f"{zone.key}, {offset(start, zone)}",
+        period=days(start, stop),
+        count=len(batches),
+        quality=[(i, word, int((level == i).sum())) for i, word in enumerate(LEVELS)],
+        flags=[
+            (name.replace("_", " "), sum(int(((flags(d) & bit) > 0).sum()) for d in products), LEVELS[severity], meaning)
+            for name, (bit, severity, meaning) in QUALITY_FLAGS.items()
+            if raised & bit
+        ],
+        numbers=_key_numbers(products),
+        without=len(batches) - int(np.concatenate([has_profile(dataset) for dataset in products]).sum()),
+        panels=marked(panels),
+        batches=shown,
+        columns=COLUMNS,
+        rows=_table(products),
+        attributes=[(identity["archive"], *_attributes(d)) for identity, d in zip(identities, products, strict=True)],
+        identities=identities,
+        software=str(products[0].attrs.get("software", products[0].attrs.get("coslidar_version", ""))),
+        method=METHOD,
+    )
+
+
+def write_report(
+    datasets: Dataset | Iterable[Dataset], path: str | os.PathLike[str], *, title: str | None = None, most_batches: int = 12
+) -> Path:
+    """Write the report of one or more products; what stood under that name is replaced only when the page is complete.
+
+    Parameters
+    ----------
+    datasets, title, most_batches
+        As in :func:`render`.
+    path : path-like
+        File to write; its folder is made where it is missing.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    target = Path(path)
+    text = render(datasets, title=title, most_batches=most_batches)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        temporary.write_bytes(text.encode("utf-8"))
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return target

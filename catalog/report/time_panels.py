@@ -1,0 +1,375 @@
+"""Figures over time: time-distance map, direct against retrieved numbers, fit, quality.
+
+Each `draw_…` function draws into axes that the caller made and returns them, each `compose_…` lays out a whole figure
+of the report, and each `describe_…` says in words what the figure shows.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...pipeline.products import QUALITY_FLAGS
+from .reading import DAY, LEVELS, Series, bounds, edges, flag_names, flags, levels, listed, series, span, values
+from .style import BLUE, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
+from .words import clock, days, month, number, offset, scientific, site_zone
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from xarray import Dataset
+    from matplotlib.figure import Figure
+
+#: More points than this are drawn as a line without a marker each.
+MARKED = 120
+
+
+def _tick(value: float, zone: datetime.tzinfo, width: float) -> str:
+    when = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC) + datetime.timedelta(days=float(value))
+    when = (when + datetime.timedelta(microseconds=500)).astimezone(zone)
+    if width > 7:
+        return f"{when.day} {month(when.month)}"
+    if width > 1.05:
+        return f"{when:%H:%M}\n{when.day} {month(when.month)}"
+    if width > 4 / 1440:
+        return f"{when:%H:%M}"
+    return f"{when:%H:%M:%S}"
+
+
+def time_axis(ax: Axes, datasets: Sequence[Dataset], *, local: bool = True, labels: bool = True) -> Axes:
+    """Set up the time axis: UTC below and, where the site's time zone is known, local time above.
+
+    Parameters
+    ----------
+    ax : Axes
+        Axes whose x are days since 1970 UTC.
+    datasets : sequence of Dataset
+        Products, for the limits and the time zone.
+    local : bool
+        Show local time above.
+    labels : bool
+        Write tick labels and the name of the axis below.
+    """
+    from matplotlib.dates import AutoDateLocator
+
+    start, stop = span(datasets)
+    pad = 0.01 * max(stop - start, 1_000_000_000)
+    low, high = (start - pad) / DAY, (stop + pad) / DAY
+    ax.set_xlim(low, high)
+    width = high - low
+
+    def ticks(axis: object, zone: datetime.tzinfo) -> None:
+        axis.set_major_locator(AutoDateLocator(tz=zone, minticks=3, maxticks=8, interval_multiples=True))  # type: ignore[attr-defined]
+        axis.set_major_formatter(lambda value, _: _tick(value, zone, width))  # type: ignore[attr-defined]
+
+    ticks(ax.xaxis, datetime.UTC)
+    if labels:
+        ax.set_xlabel(f"UTC, {days(start, stop)}")
+    else:
+        ax.tick_params(axis="x", labelbottom=False)
+    zone = site_zone(datasets[0].attrs)
+    if local and zone is not None:
+        above = ax.secondary_xaxis("top")
+        ticks(above.xaxis, zone)
+        shifts = dict.fromkeys([offset(start, zone), offset(stop, zone)])
+        above.set_xlabel(f"local time, {zone.key} ({', then '.join(shifts)})", labelpad=7)
+        above.tick_params(colors=INK)
+    return ax
+
+
+def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw the time-distance map of Cn2: logarithmic scale from the data, gaps blank, bounded values hatched.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    datasets : Dataset or sequence of Dataset
+        Products; their slices may differ.
+
+    Returns
+    -------
+    Axes
+        `ax`.
+    """
+    from matplotlib.colors import LogNorm
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    products = listed(datasets)
+    scale = cn2_scale(products)
+    image, corners = None, []
+    for dataset in products:
+        cn2, limit, border = values(dataset, "cn2"), bounds(dataset) / DAY, edges(dataset)
+        if cn2 is None:
+            continue
+        active = _active(dataset, cn2)
+        shown = np.ma.masked_where(~np.isfinite(cn2) | active, cn2)
+        if scale is not None:
+            for first, last in _uninterrupted(limit):
+                image = ax.pcolormesh(
+                    np.append(limit[first:last, 0], limit[last - 1, 1]), border, shown[first:last].T,
+                    norm=LogNorm(*scale), cmap=SEQUENTIAL, rasterized=True, shading="flat",
+                )  # fmt: skip
+        for first, last in _uninterrupted(limit):
+            for j in range(active.shape[1]):
+                for start, stop in _runs(active[first:last, j]):
+                    corners.append((limit[first + start, 0], limit[first + stop - 1, 1], border[j], border[j + 1]))
+    if corners:
+        boxes = [Path([(a, c), (b, c), (b, d), (a, d), (a, c)], closed=True) for a, b, c, d in corners]
+        ax.add_patch(PathPatch(Path.make_compound_path(*boxes), fc="none", ec=MUTED, hatch="///", lw=0.6))
+    ax.set_ylim(min(edges(d)[0] for d in products), max(edges(d)[-1] for d in products))
+    ax.set_ylabel("distance from the pupil z (m)")
+    time_axis(ax, products)
+    if image is not None:
+        bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")  # type: ignore[union-attr]
+        bar.set_label(r"$C_n^2$ (m$^{-2/3}$)")
+        bar.outline.set_linewidth(0.6)
+    return ax
+
+
+def _active(dataset: Dataset, cn2: np.ndarray) -> np.ndarray:
+    bound = values(dataset, "cn2_at_bound")
+    return (np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0) & np.isfinite(cn2)
+
+
+def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
+    """[start, stop) of each run of true values."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[0], flag.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in turns.reshape(-1, 2)]
+
+
+def _uninterrupted(limit: np.ndarray) -> list[tuple[int, int]]:
+    """[first, last) of each stretch of batches that follow each other within a tenth of a batch."""
+    gap = limit[1:, 0] - limit[:-1, 1]
+    cuts = np.flatnonzero(np.abs(gap) > 0.1 * np.median(limit[:, 1] - limit[:, 0])) + 1
+    return [(int(a), int(b)) for a, b in zip(np.append(0, cuts), np.append(cuts, len(limit)), strict=True)]
+
+
+def cn2_scale(datasets: Sequence[Dataset]) -> tuple[float, float] | None:
+    """Limits of the logarithmic Cn2 scale: the middle 98 % of the positive values; None without any."""
+    found = []
+    for dataset in datasets:
+        cn2 = values(dataset, "cn2")
+        if cn2 is not None:
+            found.append(cn2[np.isfinite(cn2) & (cn2 > 0) & ~_active(dataset, cn2)])
+    positive = np.concatenate(found) if found else np.empty(0)
+    if not positive.size:
+        return None
+    low, high = np.percentile(positive, [1, 99])
+    return (float(low), float(high)) if high > 1.5 * low else (float(low / 1.5), float(high * 1.5))
+
+
+def compose_time_distance(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out the figure of the time-distance map."""
+    draw_time_distance(figure.add_axes((0.1, 0.15, 0.83, 0.67)), datasets)
+
+
+def describe_time_distance(datasets: Sequence[Dataset]) -> str:
+    """Say where and when Cn2 is largest, and how much of the map is blank or bounded."""
+    best, words, total, bounded, blank = 0.0, "", 0, 0, 0
+    for dataset in datasets:
+        cn2 = values(dataset, "cn2")
+        if cn2 is None:
+            continue
+        total += cn2.size
+        blank += int((~np.isfinite(cn2)).sum())
+        bounded += int(_active(dataset, cn2).sum())
+        if np.isfinite(cn2).any() and np.nanmax(cn2) > best:
+            best = float(np.nanmax(cn2))
+            i, j = np.unravel_index(np.nanargmax(cn2), cn2.shape)
+            border = edges(dataset)
+            words = (
+                f"The largest value is {scientific(best)} m^(-2/3), {number(border[j], 4)} to {number(border[j + 1], 4)} m away "
+                f"at {clock(int(bounds(dataset)[i, 0]))} UTC. "
+            )
+    return f"{words}Of {total} values {bounded} are at the bound of zero and {blank} are missing."
+
+
+def _follow(ax: Axes, line: Series | None, label: str, **style: object) -> None:
+    if line is not None and np.isfinite(line.values).any():
+        if line.values.size > MARKED:
+            style["marker"] = ""
+        ax.plot(line.days, line.values, label=label, **style)  # type: ignore[arg-type]
+
+
+def _from_zero(ax: Axes, *lines: Series | None) -> None:
+    top = max((float(np.nanmax(line.values)) for line in lines if line is not None and np.isfinite(line.values).any()), default=1)
+    ax.set_ylim(0, 1.12 * top if top > 0 else 1)
+    ax.grid(axis="y")
+
+
+_SOURCES = (("o", RED, (0, (1, 1.5))), ("s", GREEN, (0, (5, 2))))
+
+
+def draw_scintillation(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw the scintillation index over time, direct for each source and from the profile."""
+    return _draw_pair(ax, listed(datasets), "scintillation_index", r"$\sigma_I^2$", 1.0)
+
+
+def draw_fried_parameter(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw the Fried parameter over time in cm, direct for each source where it is known, and from the profile."""
+    return _draw_pair(ax, listed(datasets), "r0", r"$r_0$ (cm)", 100.0)
+
+
+def _draw_pair(ax: Axes, products: list[Dataset], name: str, label: str, factor: float) -> Axes:
+    lines: list[Series | None] = []
+    for component, (marker, colour, dashes) in enumerate(_SOURCES):
+        line = series(products, f"{name}_direct", component)
+        line = None if line is None else Series(line.days, factor * line.values)
+        lines.append(line)
+        _follow(ax, line, f"direct, source {component + 1}", color=colour, marker=marker, mfc=PAPER, ls=dashes, lw=1.6)
+    line = series(products, f"{name}_profile")
+    line = None if line is None else Series(line.days, factor * line.values)
+    lines.append(line)
+    _follow(ax, line, "from the profile", color=BLUE, marker="D", ls="-", ms=5)
+    _from_zero(ax, *lines)
+    ax.set_ylabel(label)
+    return time_axis(ax, products)
+
+
+def compose_strength(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out scintillation index and Fried parameter over time."""
+    above = draw_scintillation(figure.add_axes((0.1, 0.53, 0.885, 0.31)), datasets)
+    below = draw_fried_parameter(figure.add_axes((0.1, 0.1, 0.885, 0.36)), datasets)
+    time_axis(above, datasets, local=False, labels=False)
+    above.set_xlabel("")
+    for child in below.child_axes:
+        child.set_visible(False)
+    handles = {}
+    for ax in (above, below):
+        handles.update(dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True)))
+    figure.legend(list(handles.values()), list(handles), loc="upper left", bbox_to_anchor=(0.09, 1.0), ncol=3)
+
+
+def describe_strength(datasets: Sequence[Dataset]) -> str:
+    """Say the median of each number and the relative difference of direct and retrieved ones."""
+    parts = []
+    for name, words, factor, unit in (("scintillation_index", "Scintillation index", 1, ""), ("r0", "Fried parameter", 100, " cm")):
+        direct, profile = series(datasets, f"{name}_direct"), series(datasets, f"{name}_profile")
+        if profile is None or not np.isfinite(profile.values).any():
+            continue
+        text = f"{words} from the profile: median {number(factor * float(np.nanmedian(profile.values)), 3)}{unit}"
+        if direct is not None and direct.values.size == profile.values.size and np.isfinite(direct.values).any():
+            with np.errstate(divide="ignore", invalid="ignore"):
+                relative = 100 * (profile.values / direct.values - 1)
+            relative = relative[np.isfinite(relative)]
+            text += f", direct: {number(factor * float(np.nanmedian(direct.values)), 3)}{unit}"
+            if relative.size:
+                text += f"; the one from the profile is {_percent(relative)}"
+        parts.append(text + ".")
+    return " ".join(parts) or "No batch has these numbers."
+
+
+def _percent(relative: np.ndarray) -> str:
+    middle, spread = float(np.mean(relative)), float(np.std(relative))
+    side = "larger" if middle >= 0 else "smaller"
+    more = f" on average (standard deviation {number(spread, 2)} %)" if relative.size > 1 else ""
+    return f"{number(abs(middle), 2)} % {side}{more}"
+
+
+def draw_chi2(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw chi2 per datum over time with the line at 1 and the limit of the poor-fit flag."""
+    products = listed(datasets)
+    line = series(products, "chi2_reduced")
+    ax.axhline(1, color=MUTED, lw=1.2)
+    ax.axhline(3, color=RED, lw=1.2, ls=(0, (5, 3)))
+    ax.annotate("flagged above 3", (1, 3), xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points",
+                ha="right", color=RED, fontsize=11)  # fmt: skip
+    _follow(ax, line, "chi2", color=BLUE, marker="o", ls="-", ms=5)
+    _from_zero(ax, line)
+    ax.set_ylim(top=max(ax.get_ylim()[1], 3.6))
+    ax.set_ylabel(r"$\chi^2$ per datum")
+    return time_axis(ax, products)
+
+
+def draw_log_mu(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw log10(mu) over time."""
+    products = listed(datasets)
+    line = series(products, "mu")
+    if line is not None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            exponent = np.log10(line.values)
+        _follow(ax, Series(line.days, np.where(np.isfinite(exponent), exponent, np.nan)), "log mu", color=PURPLE, marker="s",
+                ls="-", ms=5)  # fmt: skip
+    low, high = ax.get_ylim()
+    if high - low < 2:
+        ax.set_ylim((low + high) / 2 - 1, (low + high) / 2 + 1)
+    ax.yaxis.set_major_formatter(lambda value, _: number(value, 4).rstrip("0").rstrip("."))
+    ax.grid(axis="y")
+    ax.set_ylabel(r"$\log_{10}\,\mu$")
+    return time_axis(ax, products)
+
+
+def compose_fit(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out chi2 and log mu over time."""
+    above = draw_chi2(figure.add_axes((0.1, 0.54, 0.885, 0.29)), datasets)
+    below = draw_log_mu(figure.add_axes((0.1, 0.13, 0.885, 0.33)), datasets)
+    time_axis(above, datasets, local=False, labels=False)
+    above.set_xlabel("")
+    for child in below.child_axes:
+        child.set_visible(False)
+
+
+def describe_fit(datasets: Sequence[Dataset]) -> str:
+    """Say median and range of chi2 and of log mu."""
+    parts = []
+    for name, words in (("chi2_reduced", "chi2 per datum"), ("mu", "log10(mu)")):
+        line = series(datasets, name)
+        if line is None:
+            continue
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = np.log10(line.values) if name == "mu" else line.values
+        found = found[np.isfinite(found)]
+        if found.size:
+            parts.append(f"{words}: median {number(float(np.median(found)), 3)}, from {number(float(found.min()), 3)} to {number(float(found.max()), 3)}")
+    return "; ".join(parts) + "." if parts else "No batch has these numbers."
+
+
+def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw when each quality flag was raised: a row per flag, with how often at its right end."""
+    products = listed(datasets)
+    limit = np.concatenate([bounds(dataset) for dataset in products]) / DAY
+    raised = np.concatenate([flags(dataset) for dataset in products])
+    order = np.argsort(limit[:, 0], kind="stable")
+    limit, raised = limit[order], raised[order]
+    start, stop = span(products)
+    least = 0.004 * (stop - start) / DAY
+    names = list(QUALITY_FLAGS)
+    for row, name in enumerate(names):
+        bit, level, _ = QUALITY_FLAGS[name]
+        here = (raised & bit) > 0
+        ax.axhline(row, color=MUTED, lw=0.5, zorder=0)
+        bars = []
+        for first, last in _uninterrupted(limit):
+            for a, b in _runs(here[first:last]):
+                left, right = limit[first + a, 0], limit[first + b - 1, 1]
+                bars.append((left, max(right - left, least)))
+        if bars:
+            ax.broken_barh(bars, (row - 0.32, 0.64), fc=RED if level == 2 else BLUE, ec=INK, lw=0.6,
+                           hatch="xxx" if level == 2 else "")  # fmt: skip
+        ax.annotate(str(int(here.sum())), (1, row), xycoords=("axes fraction", "data"), xytext=(10, 0),
+                    textcoords="offset points", va="center", weight="bold" if here.any() else "normal")  # fmt: skip
+    ax.set_ylim(len(names) - 0.5, -0.6)
+    ax.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    ax.tick_params(axis="y", length=0)
+    ax.annotate("batches", (1, 1), xycoords="axes fraction", xytext=(-6, 3), textcoords="offset points", fontsize=11)
+    return time_axis(ax, products)
+
+
+def compose_quality(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out the quality flags over time."""
+    draw_quality(figure.add_axes((0.205, 0.16, 0.725, 0.65)), datasets)
+
+
+def describe_quality(datasets: Sequence[Dataset]) -> str:
+    """Say how many batches are good, and which flags were raised how often."""
+    level = np.concatenate([levels(dataset) for dataset in datasets])
+    raised = np.concatenate([flags(dataset) for dataset in datasets])
+    counts = ", ".join(f"{int((level == i).sum())} {word}" for i, word in enumerate(LEVELS))
+    often = [
+        f"{name} {int(((raised & (1 << i)) > 0).sum())}" for i in range(31) for name in flag_names(1 << i) if ((raised & (1 << i)) > 0).any()
+    ]
+    return f"Of {level.size} batches: {counts}. " + ("Flags: " + ", ".join(often) + "." if often else "No flag was raised.")

@@ -1,0 +1,146 @@
+"""Products made of numbers that look right, in the shape that the schema declares; not physics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from coslidar.pipeline.products import COORDINATES, INTENSITY_KINDS, SCHEMA, SLOPE_KINDS
+
+START = 1_347_624_900_000_000_000  # 2012-09-14T12:15:00Z
+MASK = np.array([[0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [1, 1, 0, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0]])
+CN2 = np.array([34, 34, 34, 34, 34, 1.7, 1.7, 102, 102, 3.4, 204, 204]) * 1e-15
+LENGTH = 2670.0
+
+
+def _pairs() -> np.ndarray:
+    count = np.zeros((9, 9), dtype=np.int64)
+    at = np.argwhere(MASK)
+    for a in at:
+        for b in at:
+            count[a[0] - b[0] + 4, a[1] - b[1] + 4] += 1
+    return count
+
+
+def product(
+    batches: int = 20,
+    *,
+    sources: int = 2,
+    failed: tuple[int, ...] = (),
+    gap_after: int | None = None,
+    seconds: float = 180.0,
+    seed: int = 1,
+    slices: int = 12,
+    start: int = START,
+    decoded: bool = True,
+    attributes: dict[str, Any] | None = None,
+) -> xr.Dataset:
+    """A product with every variable of the schema; failed batches are NaN."""
+    random = np.random.default_rng(seed)
+    step = int(seconds * 1e9)
+    begin = start + step * np.arange(batches, dtype=np.int64)
+    if gap_after is not None:
+        begin[gap_after:] += 20 * step
+    edges = np.linspace(0, LENGTH, slices + 1)
+    centre = (edges[1:] + edges[:-1]) / 2
+    lag = np.arange(-4, 5) * 0.07
+    dy, dx = np.meshgrid(lag, lag, indexing="ij")
+    pairs = _pairs()
+    trend = 10 ** (-1.2 * np.arange(batches) / max(batches - 1, 1))
+    truth = np.interp(centre, (np.arange(12) + 0.5) * LENGTH / 12, CN2)
+    cn2 = truth * trend[:, None] * np.exp(0.15 * random.standard_normal((batches, slices)))
+    bound = cn2 < 3e-15 * trend[:, None]
+    cn2 = np.where(bound, 0, cn2)
+    error = 0.12 * trend[:, None] * (2e-14 + truth) * (1 + centre / LENGTH)
+    error_ml = error * np.where(centre > 1800, 10 ** ((centre - 1800) / 300), 1.2)
+
+    def bump(width_y: float, width_x: float, shift: float = 0.0) -> np.ndarray:
+        return np.exp(-((dy - shift) ** 2) / width_y**2 - dx**2 / width_x**2)
+
+    slope_model = np.stack([0.4 + bump(0.3, 0.2), 0.4 + bump(0.2, 0.3), 0.3 + 0.6 * bump(0.35, 0.15, 0.14),
+                            0.3 + 0.6 * bump(0.3, 0.2, 0.14)])  # fmt: skip
+    slope_model = 8e-12 * trend[:, None, None, None] * slope_model
+    intensity_model = np.stack([bump(0.07, 0.07), 0.35 * bump(0.15, 0.06, 0.1)]) * 0.12 * trend[:, None, None, None]
+    slope_error = 0.04 * slope_model.max() * trend[:, None, None, None] * np.ones_like(slope_model)
+    intensity_error = 0.04 * 0.12 * trend[:, None, None, None] * np.ones_like(intensity_model)
+    slopes = slope_model + slope_error * random.standard_normal(slope_model.shape)
+    intensities = intensity_model + intensity_error * random.standard_normal(intensity_model.shape)
+    for values in (slopes, slope_model, slope_error, intensities, intensity_model, intensity_error):
+        values[..., pairs == 0] = np.nan
+    if sources == 1:
+        for values in (slopes, slope_model, slope_error):
+            values[:, 2:] = np.nan
+        for values in (intensities, intensity_model, intensity_error):
+            values[:, 1:] = np.nan
+    index = 0.12 * trend
+    grid = np.arange(23, 33.01, 0.25)
+    log_mu = np.round(27 - 1.6 * np.log10(trend)) + 0.0
+    distance = (centre[:, None] - centre[None, :]) / 150
+    kernel = np.exp(-(distance**2)) / np.exp(-(distance**2)).sum(axis=1, keepdims=True) - 0.02
+    kernel *= np.clip(1.3 - centre / LENGTH, 0.1, 1)[:, None]
+    values: dict[str, Any] = {
+        "time_bounds": np.stack([begin, begin + step], axis=1),
+        "z_bounds": np.stack([edges[:-1], edges[1:]], axis=1),
+        "cn2": cn2,
+        "cn2_standard_error": error,
+        "cn2_standard_error_ml": error_ml,
+        "cn2_at_bound": bound.astype("u1"),
+        "averaging_kernel": np.repeat(kernel[None], batches, axis=0),
+        "degrees_of_freedom": np.full(batches, np.trace(kernel)),
+        "mu": 10**log_mu,
+        "criterion": 1e-3 * (1 + 0.02 * np.logaddexp(0, 3 * (grid - log_mu[:, None])) + 0.01 * np.logaddexp(0, log_mu[:, None] - grid)),
+        "slope_correlation": slopes,
+        "slope_correlation_model": slope_model,
+        "slope_correlation_error": slope_error,
+        "intensity_correlation": intensities,
+        "intensity_correlation_model": intensity_model,
+        "intensity_correlation_error": intensity_error,
+        "pair_count": pairs,
+        "r0_profile": 0.11 * trend**-0.6,
+        "scintillation_index_direct": np.stack([index * 1.03, index * 0.97], axis=1)[:, :sources],
+        "scintillation_index_profile": index * (1 + 0.02 * random.standard_normal(batches)),
+        "scintillation_index_point": index * 4,
+        "mean_flux": np.full((batches, sources), 9_000.0),
+        "noise_variance_slope": np.full((batches, 2), 3e-13),
+        "noise_variance_intensity": np.full(batches, 1e-4),
+        "slope_offset": np.full((batches, 2), 1e-12),
+        "n_frames": np.full(batches, round(142 * seconds), "i8"),
+        "n_effective": np.full((batches, 3), 300.0),
+        "valid_fraction": np.full((batches, sources), 0.9991),
+        "chi2_reduced": 1 + 0.1 * random.standard_normal(batches),
+        "quality_flag": np.where(index * 4 > 0.3, 256, 0).astype("i4"),
+        "quality_level": np.where(index * 4 > 0.3, 1, 0).astype("i1"),
+    }  # fmt: skip
+    for batch in failed:
+        for name, variable in SCHEMA.items():
+            if variable.dims[0] == "time" and variable.dtype == "float64":
+                values[name][batch] = np.nan
+        values["quality_flag"][batch], values["quality_level"][batch] = 1, 2
+        values["cn2_at_bound"][batch] = 0
+        values["n_frames"][batch] = 0
+    times = begin.astype("datetime64[ns]") if decoded else begin
+    if decoded:
+        values["time_bounds"] = values["time_bounds"].astype("datetime64[ns]")
+    coordinates = {"time": times, "z": centre, "z_true": centre, "dy": lag, "dx": lag, "log_mu_grid": grid}
+    assert set(values) == set(SCHEMA)
+    assert set(coordinates) == set(COORDINATES)
+    return xr.Dataset(
+        {name: (SCHEMA[name].dims, value, {"units": SCHEMA[name].unit}) for name, value in values.items()},
+        {
+            **{name: ((name,), value) for name, value in coordinates.items()},
+            "slope_kind": list(SLOPE_KINDS),
+            "intensity_kind": list(INTENSITY_KINDS),
+        },
+        {
+            "Conventions": "CF-1.11",
+            "campaign": "lannemezan-2012",
+            "archive": "2012-09-14T1415",
+            "timezone": "Europe/Paris",
+            "wavelength": 3.8e-6,
+            "lineage_key": "0f3c" * 16,
+            "lineage": '{"stage": "profile", "version": 1, "config": {"slices": 12}}',
+            **(attributes or {}),
+        },
+    )
