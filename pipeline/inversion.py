@@ -25,13 +25,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize
 
-from . import uncertainty
+from . import posterior, uncertainty
 
 if TYPE_CHECKING:
     from .geometry import SliceGrid
@@ -511,7 +511,9 @@ def prepare(
         full = full[np.ix_(chosen, chosen)]
     if full.shape != (m, m):
         raise ValueError(f"C_conv has shape {full.shape}; expected ({n}, {n}) or ({m}, {m}) for {m} rows")
-    kept = subset_mask(n, subset)[chosen] & np.isfinite(values[:, chosen]).all(axis=0)
+    # Subapertures that are never measured leave both their data and their noise NaN.
+    measured = np.isfinite(values[:, chosen]).all(axis=0) & np.isfinite(np.diag(full))
+    kept = subset_mask(n, subset)[chosen] & measured
     if not kept.any():
         raise ValueError(f"no finite datum in the subset {subset!r}")
     chosen, full = chosen[kept], full[np.ix_(kept, kept)]
@@ -999,12 +1001,16 @@ class Profile:
         "map" or "posterior_mean".
     selection : Selection
         Hyper-parameter and criterion curve.
+    covariance : ndarray, (k, k)
+        Posterior covariance of the linear solution, m^(-4/3) (:func:`~.uncertainty.posterior_covariance`).
     error_map, error_ml : ndarray, (k,)
         Standard errors, m^(-2/3) (:func:`~.uncertainty.map_error`, :func:`~.uncertainty.ml_error`).
     averaging_kernel : ndarray, (k, k)
         d cn2_i / d truth_j (:func:`~.uncertainty.averaging_kernel`).
     degrees_of_freedom : float
         Trace of the averaging kernel.
+    posterior : Posterior or None
+        Draws from the posterior under positivity; None if neither data nor prior bound the profile.
     at_bound : ndarray of bool, (k,)
         Slices the positivity constraint holds at zero in the MAP solution.
     nuisance_names : tuple of str
@@ -1024,10 +1030,12 @@ class Profile:
     cn2: Floats
     estimator: str
     selection: Selection
+    covariance: Floats
     error_map: Floats
     error_ml: Floats
     averaging_kernel: Floats
     degrees_of_freedom: float
+    posterior: posterior.Posterior | None
     at_bound: NDArray[np.bool_]
     nuisance_names: tuple[str, ...]
     nuisance: Floats
@@ -1053,6 +1061,22 @@ class Profile:
         """Criterion curve on `log_mu_grid`."""
         return self.selection.criterion
 
+    @property
+    def interval_68(self) -> Floats:
+        """Highest-density intervals of 68 %, (k, 2), m^(-2/3); 0 to infinity if there is no posterior."""
+        return self._unbounded() if self.posterior is None else self.posterior.interval_68
+
+    @property
+    def interval_95(self) -> Floats:
+        """Highest-density intervals of 95 %, (k, 2), m^(-2/3); 0 to infinity if there is no posterior."""
+        return self._unbounded() if self.posterior is None else self.posterior.interval_95
+
+    def _unbounded(self) -> Floats:
+        return np.tile([0.0, np.inf], (len(self.cn2), 1))
+
+
+Estimator: TypeAlias = Literal["map", "posterior_mean"]
+
 
 def estimate(
     reduction: Reduction,
@@ -1062,6 +1086,8 @@ def estimate(
     *,
     grid: SliceGrid | None = None,
     neighbours: Sequence[LinearProblem] = (),
+    estimator: Estimator = "map",
+    seed: int = 0,
 ) -> Profile:
     """Profile of one data vector.
 
@@ -1079,33 +1105,53 @@ def estimate(
         The slices.
     neighbours : sequence of LinearProblem
         Problems of neighbouring batches.
+    estimator : {"map", "posterior_mean"}
+        The minimiser of J under positivity (Sauvage et al. 2021), or the mean of the posterior under
+        positivity, which has the least expected squared error if the prior is right.
+    seed : int
+        Seed of the draws from the posterior.
 
     Returns
     -------
     Profile
+
+    Raises
+    ------
+    ValueError
+        If the data are not finite, or the posterior mean is asked for and does not exist.
     """
     values: Floats = np.asarray(data, dtype=float)
     problem = reduction.problem(values, precision, grid=grid, neighbours=neighbours)
     selection = selector.select(problem)
-    best = solve_positive(problem, selection.mu)
+    mode = solve_positive(problem, selection.mu)
+    drawn = posterior.sample(problem, selection.mu, seed=seed) if posterior.proper(problem, selection.mu) else None
+    if estimator == "posterior_mean":
+        if drawn is None:
+            raise ValueError("neither the data nor the prior bound the profile: it has no posterior mean")
+        best = drawn.mean
+    elif estimator == "map":
+        best = mode
+    else:
+        raise ValueError(f"no estimator {estimator!r}; there are: map, posterior_mean")
     rest = problem.matrix @ best - problem.data
     chi2 = float(rest @ rest)
     kernel = uncertainty.averaging_kernel(problem, selection.mu)
     freedom = float(np.trace(kernel))
-    nuisance, nuisance_error = reduction.nuisance(
-        values, best, uncertainty.posterior_covariance(problem, selection.mu)
-    )
+    covariance = uncertainty.posterior_covariance(problem, selection.mu)
+    nuisance, nuisance_error = reduction.nuisance(values, best, covariance)
     model = reduction.response @ best + reduction.design @ np.nan_to_num(nuisance)
     remaining = len(problem.data) - freedom
     return Profile(
         cn2=best,
-        estimator="map",
+        estimator=estimator,
         selection=selection,
-        error_map=uncertainty.map_error(problem, selection.mu),
+        covariance=covariance,
+        error_map=np.sqrt(np.diag(covariance)),
         error_ml=uncertainty.ml_error(problem),
         averaging_kernel=kernel,
         degrees_of_freedom=freedom,
-        at_bound=best == 0,
+        posterior=drawn,
+        at_bound=mode == 0,
         nuisance_names=reduction.names,
         nuisance=nuisance,
         nuisance_error=nuisance_error,
@@ -1130,6 +1176,8 @@ def invert(
     noise_bias: bool = True,
     slope_offset: bool = True,
     neighbours: Sequence[LinearProblem] = (),
+    estimator: Estimator = "map",
+    seed: int = 0,
 ) -> Profile:
     """Profile from correlations, their covariance and the response matrix.
 
@@ -1155,6 +1203,10 @@ def invert(
         Unpenalised unknowns (:func:`nuisance_design`).
     neighbours : sequence of LinearProblem
         Problems of neighbouring batches, for selectors that smooth.
+    estimator : {"map", "posterior_mean"}
+        As in :func:`estimate`.
+    seed : int
+        Seed of the draws from the posterior.
 
     Returns
     -------
@@ -1168,4 +1220,13 @@ def invert(
     reduction = prepare(
         data, covariance, matrix, rows=rows, subset=subset, noise_bias=noise_bias, slope_offset=slope_offset
     )
-    return estimate(reduction, data, regulariser.precision(grid), selector, grid=grid, neighbours=neighbours)
+    return estimate(
+        reduction,
+        data,
+        regulariser.precision(grid),
+        selector,
+        grid=grid,
+        neighbours=neighbours,
+        estimator=estimator,
+        seed=seed,
+    )

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from ..pipeline import inversion
+from ..pipeline import inversion, posterior
 from ..pipeline.units import Hyperparameter
 from .contract import HyperparameterSelectorBase
 
@@ -81,6 +81,20 @@ class Evidence(_Ranged):
         return inversion.select_minimum("evidence", self.log_mu, inversion.evidence(problem, self.log_mu))
 
 
+class PositiveEvidence(_Ranged):
+    """Largest marginal likelihood of the data under the Gaussian prior cut off at Cn2 >= 0.
+
+    What the profile can be enters the choice of mu as it enters the profile.
+    """
+
+    name: ClassVar[str] = "positive_evidence"
+
+    def select(self, problem: LinearProblem) -> Selection:
+        """Take mu of the largest evidence; the curve is -2 log of it, up to a constant."""
+        curve = posterior.positive_evidence(problem, self.log_mu)
+        return inversion.select_minimum("positive_evidence", self.log_mu, curve)
+
+
 class UPRE(_Ranged):
     """Unbiased predictive risk (Mallows 1973): the smallest expected error of the fitted correlations."""
 
@@ -127,7 +141,7 @@ class Previous(_Ranged):
 
     name: ClassVar[str] = "previous"
 
-    criterion: Literal["gcv", "evidence", "upre"] = "gcv"
+    criterion: Literal["gcv", "evidence", "positive_evidence", "upre"] = "gcv"
     """Criterion that is summed."""
 
     def select(self, problem: LinearProblem) -> Selection:
@@ -138,6 +152,8 @@ class Previous(_Ranged):
     def _curve(self, problem: LinearProblem) -> NDArray[np.float64]:
         if self.criterion == "evidence":
             return inversion.evidence(problem, self.log_mu)
+        if self.criterion == "positive_evidence":
+            return posterior.positive_evidence(problem, self.log_mu)
         if self.criterion == "upre":
             return inversion.upre(problem, self.log_mu)
         return np.asarray(len(problem.data) * np.log(inversion.gcv(problem, self.log_mu)))
