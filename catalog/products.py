@@ -103,7 +103,7 @@ def check_name(name: object, what: str) -> str:
         It is not 1 to 100 letters, digits, ``.``, ``_`` and ``-`` beginning with a letter or digit.
     """
     try:
-        return TypeAdapter(Name).validate_python(name, strict=True)
+        return str(TypeAdapter(Name).validate_python(name, strict=True))
     except ValidationError:
         raise ProductError(
             f"{what} = {safe(repr(name)[:120])}: use 1 to 100 letters, digits, '.', '_' and '-', beginning with a "
@@ -583,7 +583,7 @@ def open_product(path: str | os.PathLike[str]) -> xr.Dataset:
     store = ZipStore(target, mode="r")
     try:
         with xr.open_zarr(store, consolidated=False, chunks=None) as lazy:
-            dataset = lazy.load()
+            dataset: xr.Dataset = lazy.load()
     except Exception as error:
         raise ProductError(f"{name}: the product cannot be read: {error}") from error
     finally:
