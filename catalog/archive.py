@@ -418,7 +418,7 @@ def _instead(store: Store) -> str:
             f"zarr.json must be at the root of the zip, found '{nested}'; "
             "pack the contents of the folder, not the folder"
         )
-    return "there is no zarr.json in it; name the folder, zip or URL that a recording was written to"
+    return "there is no zarr.json in it that can be read; name the folder, zip or URL that a recording was written to"
 
 
 # --- validation --------------------------------------------------------------------------------------------

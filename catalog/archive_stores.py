@@ -214,7 +214,7 @@ def open_store(url: str) -> Store:
     """
     for scheme in ("file://", "local://"):
         url = url.removeprefix(scheme)
-    if "://" not in url and "::" not in url:
+    if os.path.lexists(url) or ("://" not in url and "::" not in url):
         if os.path.isdir(url):
             return FolderStore(url)
         if not os.path.exists(url):
@@ -303,18 +303,19 @@ def _is_http(fs: Any) -> bool:
     return "http" in protocol or "https" in protocol
 
 
-def _absent(error: BaseException) -> bool:
+def _absent(fs: Any, error: BaseException) -> bool:
+    if not isinstance(error, FileNotFoundError):
+        return False
     # fsspec reports every failure of an HTTP request for information as "not found"; only these mean it.
     # Object stores answer 403 for a key that is not there when listing is not permitted.
-    cause = error.__cause__
-    return isinstance(error, FileNotFoundError) and (cause is None or getattr(cause, "status", None) in (403, 404, 410))
+    return not _is_http(fs) or getattr(error.__cause__, "status", None) in (403, 404, 410)
 
 
 def _remote_size(fs: Any, path: str) -> int | None:
     try:
         entry = fs.info(path)
     except Exception as error:
-        if _absent(error):
+        if _absent(fs, error):
             return None
         raise StoreError(f"the server does not answer as it should ({_said(error.__cause__ or error)})") from error
     if entry.get("type") == "directory":

@@ -132,12 +132,23 @@ def write_archive(
         )
         if os.path.lexists(target) and not overwrite:
             raise FileExistsError(f"{target} was made by something else meanwhile; nothing was replaced")
-        if os.path.lexists(target) and (target.is_dir() or made.is_dir()):
-            os.rename(target, work / "replaced")
-        os.replace(made, target)
+        _replace(made, target, work / "replaced")
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target
+
+
+def _replace(made: Path, target: Path, aside: Path) -> None:
+    # A file replaces a file in one step; a folder that is not empty has to be moved out of the way.
+    moved = os.path.lexists(target) and (target.is_dir() or made.is_dir())
+    if moved:
+        os.rename(target, aside)
+    try:
+        os.replace(made, target)
+    except BaseException:
+        if moved:
+            os.rename(aside, target)
+        raise
 
 
 def _chunked(

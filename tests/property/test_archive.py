@@ -58,13 +58,13 @@ def spoiled(data: st.DataObject, document: dict[str, Any]) -> dict[str, Any]:
             parent = parent[key]
         match data.draw(st.sampled_from(["replace", "remove", "double"])):
             case "replace":
-                parent[leaf] = data.draw(ANY)
+                parent[leaf] = copy.deepcopy(data.draw(ANY))
             case "remove":
                 del parent[leaf]
             case "double" if isinstance(parent, list):
-                parent.append(parent[leaf])
+                parent.append(copy.deepcopy(parent[leaf]))
             case _:
-                parent[f"{leaf}x"] = parent[leaf]
+                parent[f"{leaf}x"] = copy.deepcopy(parent[leaf])
     return document
 
 

@@ -818,6 +818,38 @@ def test_a_decompression_bomb_is_refused_without_allocation(small: Path, compres
     assert peak < 2_000_000
 
 
+@pytest.mark.parametrize("change", ["cut", "promise less", "promise more", "no block", "no type", "version"])
+def test_a_blosc_header_is_checked_before_the_decoder_sees_it(
+    small: Path, change: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replace_frames(small, small_frames(small_header(), 40), compressors=[BloscCodec()])
+    chunk = small / "frames/c/0/0/0"
+    data = bytearray(chunk.read_bytes())
+    size = 16 * 48 * 30 * 2
+    match change:
+        case "cut":
+            data = data[:-100]
+        case "promise less":
+            data[4:8] = struct.pack("<I", size - 2)
+        case "promise more":
+            data[4:8] = struct.pack("<I", size + 2)
+        case "no block":
+            data[8:12] = bytes(4)
+        case "no type":
+            data[3] = 0
+        case "version":
+            data[0] = 77
+    chunk.write_bytes(data)
+    archive = open_archive(small)
+
+    def decompress(*args: Any) -> None:
+        raise AssertionError("the decoder was called")
+
+    monkeypatch.setattr("numcodecs.blosc.decompress", decompress)
+    with pytest.raises(ChunkError, match="blosc header"):
+        archive.read_chunk(0)
+
+
 @pytest.mark.parametrize("checksum", [True, False], ids=["crc32c", "bare"])
 @pytest.mark.parametrize("cname", ["lz4", "zstd", "blosclz"])
 def test_damaged_blosc_chunks_never_crash_the_process(small: Path, cname: str, checksum: bool) -> None:
@@ -838,7 +870,7 @@ def test_damaged_blosc_chunks_never_crash_the_process(small: Path, cname: str, c
         good = archive.read_chunk(1)
         random = np.random.default_rng(0)
         wrong = 0
-        for trial in range(400):
+        for trial in range(200):
             data = bytearray(whole)
             if trial % 4 == 0:
                 data = data[: int(random.integers(1, len(data)))]
@@ -921,3 +953,16 @@ def test_http_urls(small: Path, served: tuple[Path, str, str]) -> None:
         open_archive(f"{ranges}/absent.zip")
     with pytest.raises(ArchiveError, match="does not answer"):
         open_archive("http://127.0.0.1:9/a.zarr")
+
+
+def test_a_failed_replacement_puts_back_what_was_there(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = open_archive(small).identity
+
+    def replace(*args: Any) -> None:
+        raise OSError("disk is full")
+
+    monkeypatch.setattr(os, "replace", replace)
+    with pytest.raises(OSError, match="disk is full"):
+        write_small(small, seed=1, overwrite=True)
+    assert open_archive(small).identity == before
+    assert [p.name for p in small.parent.iterdir()] == [small.name]
