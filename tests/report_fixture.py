@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,16 @@ START = 1_347_624_900_000_000_000  # 2012-09-14T12:15:00Z
 MASK = np.array([[0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [1, 1, 0, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0]])
 CN2 = np.array([34, 34, 34, 34, 34, 1.7, 1.7, 102, 102, 3.4, 204, 204]) * 1e-15
 LENGTH = 2670.0
+LINEAGE = {
+    "scheme": 1,
+    "key": "0f3c" * 16,
+    "nodes": {
+        "0f3c" * 16: {"stage": "profile", "version": 2, "tracked": {"noise_bias": "joint"}, "upstream": ["ab12" * 16],
+                      "plugins": {"regulariser": {"name": "white", "version": 1}}},
+        "ab12" * 16: {"stage": "response", "version": 3, "tracked": {"slices": 12}, "upstream": [], "plugins": {}},
+    },
+}  # fmt: skip
+PROVENANCE = {"agent": {"coslidar:software": {"prov:label": "coslidar 0.1.0", "coslidar:commit": "57b8f58"}}}
 
 
 def _pairs() -> np.ndarray:
@@ -130,6 +141,7 @@ def product(
         {name: (SCHEMA[name].dims, value, {"units": SCHEMA[name].unit}) for name, value in values.items()},
         {
             **{name: ((name,), value) for name, value in coordinates.items()},
+            "source": ["bottom", "top"][:sources],
             "slope_kind": list(SLOPE_KINDS),
             "intensity_kind": list(INTENSITY_KINDS),
         },
@@ -138,9 +150,10 @@ def product(
             "campaign": "lannemezan-2012",
             "archive": "2012-09-14T1415",
             "timezone": "Europe/Paris",
-            "wavelength": 3.8e-6,
+            "wavelength": "3.8e-06 m",
             "lineage_key": "0f3c" * 16,
-            "lineage": '{"stage": "profile", "version": 1, "config": {"slices": 12}}',
+            "lineage": json.dumps(LINEAGE),
+            "provenance": json.dumps(PROVENANCE),
             **(attributes or {}),
         },
     )

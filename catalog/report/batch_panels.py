@@ -161,7 +161,7 @@ def describe_profile(dataset: Dataset, batch: int) -> str:
     error, _, active, _ = _limits(dataset, batch, cn2.shape)
     peak = int(np.nanargmax(cn2))
     text = (
-        f"Cn2 in {cn2.size} slices from {number(border[0], 4)} to {number(border[-1], 4)} m. The strongest slice, "
+        f"Cn² in {cn2.size} slices from {number(border[0], 4)} to {number(border[-1], 4)} m. The strongest slice, "
         f"{number(border[peak], 4)} to {number(border[peak + 1], 4)} m, holds {measured(cn2[peak], error[peak])} m^(-2/3)."
     )
     count = int(active.sum())
@@ -255,7 +255,7 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
         return
     groups = [group for group in ([i for i in items if i.is_slope], [i for i in items if not i.is_slope]) if group]
     width, left, gap, bar = CORRELATION_SIZE[0], 0.86, 0.12, 0.85
-    cell = min(1.6, (width - left - bar * len(groups) - gap * (len(items) - len(groups))) / len(items))
+    cell = min(1.9, (width - left - bar * len(groups) - gap * (len(items) - len(groups))) / len(items))
     rows = {"cut": 0.55, "residual": 0.55 + _CUT + 0.92}
     rows["model"] = rows["residual"] + cell + 0.36
     rows["measured"] = rows["model"] + cell + 0.14
@@ -278,7 +278,9 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
 
     for name, y in rows.items():
         text, size = ("at dx = 0", _CUT) if name == "cut" else (name, cell)
-        figure.text(0.012, (y + size / 2) / height, text, rotation=90, va="center", ha="center", weight="bold", fontsize=13)
+        figure.text(
+            0.012, (y + size / 2) / height, text, rotation=90, va="center", ha="center", weight="bold", fontsize=13
+        )
     x = left
     for group in groups:
         unit, words = (_MICRO, "µrad²") if group[0].is_slope else (1.0, "index")
@@ -351,7 +353,7 @@ def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     lowest = curve[finite].min()
     ratio = lowest > 0
     shown = curve / lowest if ratio else curve - lowest
-    ax.plot(grid, shown, "-", color=BLUE, marker=".", ms=6)
+    ax.plot(grid[finite], shown[finite], "-", color=BLUE, marker=".", ms=6)
     ax.set_ylabel("criterion / its minimum" if ratio else "criterion − its minimum")
     if ratio and np.nanmax(shown[finite]) > 20:
         from matplotlib.ticker import LogFormatter, NullFormatter

@@ -15,13 +15,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...pipeline.products import QUALITY_FLAGS
 from . import batch_panels as one
 from . import time_panels as over
-from .reading import LEVELS, bounds, flag_names, flags, has_profile, levels, listed, log_mu, of_batch, scalar, span, values
+from .reading import (
+    LEVELS,
+    bounds,
+    edges,
+    flag_names,
+    flags,
+    has_profile,
+    levels,
+    listed,
+    log_mu,
+    of_batch,
+    scalar,
+    span,
+    values,
+)
 from .style import figure_style
 from .svg import inline_svg
 from .words import NOTHING, clean, clock, days, interval, mapping, measured, number, offset, scientific, site_zone
-from ...pipeline.products import QUALITY_FLAGS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,8 +48,8 @@ METHOD = (
     "Applied Optics 60 (34), 10499-10519 (2021), doi:10.1364/AO.438170"
 )
 
-#: Characters of a lineage or provenance that the page shows.
-SHOWN = 60_000
+#: Characters of lineage and provenance that a page shows.
+SHOWN = 200_000
 
 
 @dataclass(frozen=True)
@@ -68,7 +82,15 @@ class BatchPanel:
 
 @dataclass(frozen=True)
 class TimePanel:
-    """A figure over all batches, named after the question it answers; fields as in :class:`BatchPanel`."""
+    """A figure over all batches, named after the question it answers.
+
+    Parameters
+    ----------
+    key, title, reading, size, compose, describe
+        As in :class:`BatchPanel`, for all batches.
+    variables : tuple of str
+        The figure says something only where one of them has a value; always where there are none.
+    """
 
     key: str
     title: str
@@ -76,6 +98,7 @@ class TimePanel:
     size: tuple[float, float]
     compose: Callable[[Figure, Sequence[Dataset]], None]
     describe: Callable[[Sequence[Dataset]], str]
+    variables: tuple[str, ...] = ()
 
 
 BATCH_PANELS = (
@@ -131,6 +154,7 @@ TIME_PANELS = (
         (10.0, 4.9),
         over.compose_time_distance,
         over.describe_time_distance,
+        ("cn2",),
     ),
     TimePanel(
         "strength",
@@ -141,6 +165,7 @@ TIME_PANELS = (
         (10.0, 5.6),
         over.compose_strength,
         over.describe_strength,
+        ("scintillation_index_profile", "scintillation_index_direct", "r0_profile", "r0_direct"),
     ),
     TimePanel(
         "fit",
@@ -150,11 +175,12 @@ TIME_PANELS = (
         (10.0, 4.8),
         over.compose_fit,
         over.describe_fit,
+        ("chi2_reduced", "mu"),
     ),
     TimePanel(
         "quality",
         "Which batches need care?",
-        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number on the right counts the batches.",
+        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number behind its name counts the batches.",
         (10.0, 4.3),
         over.compose_quality,
         over.describe_quality,
@@ -174,23 +200,32 @@ def figure(panel: BatchPanel | TimePanel, datasets: Dataset | Sequence[Dataset],
     batch : int
         Number of the batch in that product.
     """
+    with figure_style():
+        return _draw(panel, listed(datasets), batch)
+
+
+def _draw(panel: BatchPanel | TimePanel, products: Sequence[Dataset], batch: int) -> Figure:
     from matplotlib.figure import Figure
 
-    products = listed(datasets)
-    with figure_style():
-        drawn = Figure(figsize=panel.size)
-        if isinstance(panel, BatchPanel):
-            panel.compose(drawn, products[0], batch)
-        else:
-            panel.compose(drawn, products)
+    drawn = Figure(figsize=panel.size)
+    if isinstance(panel, BatchPanel):
+        panel.compose(drawn, products[0], batch)
+    else:
+        panel.compose(drawn, products)
     return drawn
+
+
+def _says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
+    found = [values(dataset, name) for dataset in products for name in panel.variables]
+    return not panel.variables or any(value is not None and bool(np.isfinite(value).any()) for value in found)
 
 
 def _markup(panel: BatchPanel | TimePanel, prefix: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
     text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
-    drawn = figure(panel, products, batch)
-    with figure_style():
-        svg = inline_svg(drawn, prefix, panel.title, text)
+    svg = ""
+    if isinstance(panel, BatchPanel) or _says_something(panel, products):
+        with figure_style():
+            svg = inline_svg(_draw(panel, products, batch), prefix, panel.title, text)
     return {"title": panel.title, "reading": panel.reading, "text": text, "svg": svg, "key": panel.key}
 
 
@@ -209,7 +244,9 @@ def _spread(found: Sequence[float], factor: float = 1.0) -> tuple[str, str]:
         return NOTHING, ""
     if finite.size == 1:
         return number(float(finite[0]), 3), ""
-    return number(float(np.median(finite)), 3), f"median; {number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}"
+    return number(
+        float(np.median(finite)), 3
+    ), f"median; {number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}"
 
 
 def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
@@ -239,12 +276,17 @@ def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
     ]
 
 
+def _path(dataset: Dataset) -> str:
+    border = edges(dataset)
+    return f"{border.size - 1} slices, {number(border[0], 4)} to {number(border[-1], 4)} m from the pupil"
+
+
 def path_mean(dataset: Dataset, batch: int) -> tuple[float, float]:
     """Cn2 averaged over the path and the largest error that its MAP bars allow, m^(-2/3); NaN without a profile."""
     cn2, error = of_batch(dataset, "cn2", batch), of_batch(dataset, "cn2_standard_error", batch)
     if cn2 is None or not np.isfinite(cn2).all():
         return float("nan"), float("nan")
-    width = np.diff(one.edges(dataset))
+    width = np.diff(edges(dataset))
     share = width / width.sum()
     # Errors of neighbouring slices are correlated, mostly negatively, and a product holds no correlation: their plain
     # sum is the largest that it can be.
@@ -300,19 +342,67 @@ def _table(products: Sequence[Dataset]) -> list[dict[str, Any]]:
     return rows
 
 
-def _pretty(value: object) -> str:
-    decoded = mapping(value)
-    text = json.dumps(decoded, indent=2, sort_keys=True, default=str, ensure_ascii=False) if decoded else str(value)
-    return text if len(text) <= SHOWN else text[:SHOWN] + f"\n… {len(text) - SHOWN} characters more in the product"
+def _documents(products: Sequence[Dataset]) -> list[dict[str, Any]]:
+    """For each product its short attributes, the stages it went through, and its documents as long as there is room."""
+    room, written = SHOWN, []
+    for dataset in products:
+        short, long = [], []
+        for name, value in dataset.attrs.items():
+            decoded = mapping(value)
+            text = (
+                json.dumps(decoded, indent=1, sort_keys=True, default=str, ensure_ascii=False)
+                if decoded
+                else str(value)
+            )
+            if len(text) <= 120 and "\n" not in text:
+                short.append((str(name), text))
+            elif len(text) <= room:
+                room -= len(text)
+                long.append((str(name), text))
+            else:
+                long.append((str(name), f"left out here ({len(text)} characters); the product file has it"))
+        written.append({
+            "archive": str(dataset.attrs.get("archive", "unnamed archive")),
+            "key": str(dataset.attrs.get("lineage_key", "")),
+            "short": short,
+            "long": long,
+            "stages": _stages(dataset) if room > 0 else [],
+        })  # fmt: skip
+    return written
 
 
-def _attributes(dataset: Dataset) -> tuple[list[tuple[str, str]], list[tuple[str, str]]]:
-    """Global attributes: short ones, and documents."""
-    short, long = [], []
-    for name, value in dataset.attrs.items():
-        text = _pretty(value)
-        (long if len(text) > 120 or "\n" in text else short).append((str(name), text))
-    return short, long
+def _stages(dataset: Dataset) -> list[list[str]]:
+    """Stage, version, plugins and parameters of each step of the lineage."""
+    nodes = mapping(mapping(dataset.attrs.get("lineage")).get("nodes"))
+    rows = []
+    for node in (mapping(node) for node in nodes.values()):
+        plugins, tracked = node.get("plugins"), node.get("tracked")
+        rows.append([str(node.get("stage", "")), str(node.get("version", "")), _flat(plugins), _flat(tracked)])
+    return sorted(rows)
+
+
+def _flat(value: object, depth: int = 0) -> str:
+    """Nested settings in one line."""
+    if isinstance(value, dict):
+        text = ", ".join(f"{name} = {_flat(item, depth + 1)}" for name, item in sorted(value.items(), key=str))
+    elif isinstance(value, list):
+        text = ", ".join(_flat(item, depth + 1) for item in value)
+    else:
+        text = "none" if value is None else str(value)
+    text = text if len(text) <= 600 else text[:600] + " …"
+    return f"({text})" if depth and isinstance(value, dict | list) else text
+
+
+def _software(products: Sequence[Dataset]) -> str:
+    """Name, version and commit of the software that made the products."""
+    found = []
+    for dataset in products:
+        agents = mapping(mapping(dataset.attrs.get("provenance")).get("agent"))
+        for agent in (mapping(agent) for agent in agents.values()):
+            label, commit = agent.get("prov:label"), agent.get("coslidar:commit")
+            if isinstance(label, str) and label.startswith("coslidar"):
+                found.append(f"{label} (commit {commit})" if commit else label)
+    return " and ".join(dict.fromkeys(found)) or "coslidar"
 
 
 def _policy(*contents: str) -> list[str]:
@@ -321,9 +411,7 @@ def _policy(*contents: str) -> list[str]:
     ]
 
 
-def render(
-    datasets: Dataset | Iterable[Dataset], *, title: str | None = None, most_batches: int = 12
-) -> str:
+def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, most_batches: int = 12) -> str:
     """Make the report of one or more products as one self-contained HTML page.
 
     Parameters
@@ -354,7 +442,10 @@ def render(
     for dataset in products:
         # Lazily loaded variables would be read once per panel.
         dataset.load()
-    source = {name: files(__package__).joinpath(name).read_text("utf-8") for name in ("report.html", "report.css", "report.js")}
+    source = {
+        name: files(__package__).joinpath(name).read_text("utf-8")
+        for name in ("report.html", "report.css", "report.js")
+    }
     source = {name: text.replace("\r\n", "\n") for name, text in source.items()}
 
     start, stop = span(products)
@@ -381,12 +472,9 @@ def render(
     panels = [
         _markup(panel, f"t{panel.key[:2]}", products)
         for panel in TIME_PANELS
-        if panel.key != "map" or (several and any(has_profile(dataset).any() for dataset in products))
+        if panel.key != "map" or (several and _says_something(panel, products))
     ]
-    identities = [
-        {"archive": str(dataset.attrs.get("archive", "unnamed archive")), "key": str(dataset.attrs.get("lineage_key", ""))}
-        for dataset in products
-    ]
+    documents = _documents(products)
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
         # Markup is what this package wrote itself; everything else may come from the header of somebody's archive.
@@ -395,7 +483,9 @@ def render(
 
     def raised_units(text: str) -> Markup:
         """Exponents written as ``m^(-2/3)`` set higher, everything else escaped."""
-        return Markup(re.sub(r"\^\(([-0-9/]+)\)", r"<sup>\1</sup>", str(escape(clean(text)))).replace("<sup>-", "<sup>−"))
+        return Markup(
+            re.sub(r"\^\(([-0-9/]+)\)", r"<sup>\1</sup>", str(escape(clean(text)))).replace("<sup>-", "<sup>−")
+        )
 
     environment.filters["units"] = raised_units
 
@@ -419,9 +509,16 @@ def render(
         zone=None if zone is None else f"{zone.key}, {offset(start, zone)}",
         period=days(start, stop),
         count=len(batches),
+        path=list(dict.fromkeys(_path(dataset) for dataset in products)),
+        wavelength=", ".join(dict.fromkeys(str(d.attrs["wavelength"]) for d in products if "wavelength" in d.attrs)),
         quality=[(i, word, int((level == i).sum())) for i, word in enumerate(LEVELS)],
         flags=[
-            (name.replace("_", " "), sum(int(((flags(d) & bit) > 0).sum()) for d in products), LEVELS[severity], meaning)
+            (
+                name.replace("_", " "),
+                sum(int(((flags(d) & bit) > 0).sum()) for d in products),
+                LEVELS[severity],
+                meaning,
+            )
             for name, (bit, severity, meaning) in QUALITY_FLAGS.items()
             if raised & bit
         ],
@@ -431,15 +528,18 @@ def render(
         batches=shown,
         columns=COLUMNS,
         rows=_table(products),
-        attributes=[(identity["archive"], *_attributes(d)) for identity, d in zip(identities, products, strict=True)],
-        identities=identities,
-        software=str(products[0].attrs.get("software", products[0].attrs.get("coslidar_version", ""))),
+        documents=documents,
+        software=_software(products),
         method=METHOD,
     )
 
 
 def write_report(
-    datasets: Dataset | Iterable[Dataset], path: str | os.PathLike[str], *, title: str | None = None, most_batches: int = 12
+    datasets: Dataset | Iterable[Dataset],
+    path: str | os.PathLike[str],
+    *,
+    title: str | None = None,
+    most_batches: int = 12,
 ) -> Path:
     """Write the report of one or more products; what stood under that name is replaced only when the page is complete.
 

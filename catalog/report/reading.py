@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ...pipeline.geometry import MAP_KINDS
 from ...pipeline.products import INTENSITY_KINDS, QUALITY_FLAGS, SLOPE_KINDS
+from .words import clean
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -168,7 +169,12 @@ def maps(dataset: Dataset, batch: int) -> list[Maps]:
         for i, kind in enumerate(kinds):
             if np.isfinite(measured[i]).any():
                 found.append(
-                    Maps(kind, measured[i], (blank if model is None else model)[i], (blank if error is None else error)[i])
+                    Maps(
+                        kind,
+                        measured[i],
+                        (blank if model is None else model)[i],
+                        (blank if error is None else error)[i],
+                    )
                 )
     return sorted(found, key=lambda item: MAP_KINDS.index(item.kind))
 
@@ -189,10 +195,19 @@ class Series:
         Middle of each batch, days since 1970 UTC.
     values : ndarray of float64
         The number.
+    half : ndarray of float64
+        Half the length of each batch, days.
     """
 
     days: Floats
     values: Floats
+    half: Floats
+
+    def mapped(self, function: Callable[[Floats], Floats]) -> Series:
+        """The same over time with each number replaced, NaN where the result is not finite."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = function(self.values)
+        return Series(self.days, np.where(np.isfinite(found), found, np.nan), self.half)
 
 
 def series(datasets: Sequence[Dataset], name: str, component: int | None = None) -> Series | None:
@@ -229,7 +244,24 @@ def series(datasets: Sequence[Dataset], name: str, component: int | None = None)
     limit, value = limit[order], value[order]
     middle = limit.mean(axis=1) / DAY
     interrupted = np.flatnonzero(limit[1:, 0] - limit[:-1, 1] > 0.5 * np.median(limit[:, 1] - limit[:, 0])) + 1
-    return Series(np.insert(middle, interrupted, middle[interrupted]), np.insert(value, interrupted, np.nan))
+    half = (limit[:, 1] - limit[:, 0]) / 2 / DAY
+    return Series(
+        np.insert(middle, interrupted, middle[interrupted]),
+        np.insert(value, interrupted, np.nan),
+        np.insert(half, interrupted, 0.0),
+    )
+
+
+def source_names(datasets: Sequence[Dataset]) -> list[str]:
+    """Names of the sources, ``source 1`` and ``source 2`` where the product has none."""
+    count = max(dataset.sizes.get("source", 0) for dataset in datasets)
+    names = [f"source {i + 1}" for i in range(count)]
+    for dataset in datasets:
+        if "source" in dataset.coords and dataset.sizes["source"] == count:
+            # Dollar signs would start a formula in a figure; a name of 1,000 characters would leave it.
+            found = [clean(name)[:24] for name in dataset["source"].values]
+            return [name.replace("$", r"\$") or names[i] for i, name in enumerate(found)]
+    return names
 
 
 def span(datasets: Sequence[Dataset]) -> tuple[int, int]:

@@ -13,17 +13,33 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...pipeline.products import QUALITY_FLAGS
-from .reading import DAY, LEVELS, Series, bounds, edges, flag_names, flags, levels, listed, series, span, values
+from .reading import (
+    DAY,
+    LEVELS,
+    Series,
+    bounds,
+    edges,
+    flag_names,
+    flags,
+    levels,
+    listed,
+    series,
+    source_names,
+    span,
+    values,
+)
 from .style import BLUE, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
 from .words import clock, days, month, number, offset, scientific, site_zone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from xarray import Dataset
     from matplotlib.figure import Figure
+    from xarray import Dataset
 
 #: More points than this are drawn as a line without a marker each.
 MARKED = 120
+#: Up to this many points a thin line shows the length of each batch.
+SPANNED = 24
 
 
 def _tick(value: float, zone: datetime.tzinfo, width: float) -> str:
@@ -38,7 +54,7 @@ def _tick(value: float, zone: datetime.tzinfo, width: float) -> str:
     return f"{when:%H:%M:%S}"
 
 
-def time_axis(ax: Axes, datasets: Sequence[Dataset], *, local: bool = True, labels: bool = True) -> Axes:
+def time_axis(ax: Axes, datasets: Sequence[Dataset]) -> Axes:
     """Set up the time axis: UTC below and, where the site's time zone is known, local time above.
 
     Parameters
@@ -47,10 +63,6 @@ def time_axis(ax: Axes, datasets: Sequence[Dataset], *, local: bool = True, labe
         Axes whose x are days since 1970 UTC.
     datasets : sequence of Dataset
         Products, for the limits and the time zone.
-    local : bool
-        Show local time above.
-    labels : bool
-        Write tick labels and the name of the axis below.
     """
     from matplotlib.dates import AutoDateLocator
 
@@ -65,18 +77,51 @@ def time_axis(ax: Axes, datasets: Sequence[Dataset], *, local: bool = True, labe
         axis.set_major_formatter(lambda value, _: _tick(value, zone, width))  # type: ignore[attr-defined]
 
     ticks(ax.xaxis, datetime.UTC)
-    if labels:
-        ax.set_xlabel(f"UTC, {days(start, stop)}")
-    else:
-        ax.tick_params(axis="x", labelbottom=False)
+    ax.set_xlabel(f"UTC, {days(start, stop)}")
     zone = site_zone(datasets[0].attrs)
-    if local and zone is not None:
+    if zone is not None:
         above = ax.secondary_xaxis("top")
         ticks(above.xaxis, zone)
         shifts = dict.fromkeys([offset(start, zone), offset(stop, zone)])
         above.set_xlabel(f"local time, {zone.key} ({', then '.join(shifts)})", labelpad=7)
         above.tick_params(colors=INK)
     return ax
+
+
+#: Inches kept free at the left, at the right, and around the time axes.
+_LEFT, _RIGHT, _LINE = 1.0, 0.45, 0.2
+
+
+def _frame(
+    figure: Figure, datasets: Sequence[Dataset], heights: Sequence[float], *, left: float = _LEFT, right: float = _RIGHT,
+    head: float = 0.0,
+) -> list[Axes]:  # fmt: skip
+    """Stack axes over a common time axis, from above, with room for the labels that this period needs."""
+    start, stop = span(datasets)
+    # Ticks of more than a day and less than a week carry the date in a second line.
+    lines = 2 if 1.05 < 1.02 * (stop - start) / DAY <= 7 else 1
+    below = 0.42 + _LINE * lines
+    above = head + (0.42 + _LINE * lines if site_zone(datasets[0].attrs) is not None else 0.15)
+    width, gap = figure.get_figwidth(), 0.42
+    height = below + sum(heights) + gap * (len(heights) - 1) + above
+    figure.set_size_inches(width, height)
+    found, y = [], height - above
+    for size in heights:
+        found.append(
+            figure.add_axes((left / width, (y - size) / height, (width - left - right) / width, size / height))
+        )
+        y -= size + gap
+    return found
+
+
+def _join(axes: Sequence[Axes]) -> None:
+    """Leave local time to the uppermost and UTC to the lowest of stacked axes."""
+    for ax in axes[:-1]:
+        ax.tick_params(axis="x", labelbottom=False)
+        ax.set_xlabel("")
+    for ax in axes[1:]:
+        for child in ax.child_axes:
+            child.set_visible(False)
 
 
 def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
@@ -119,7 +164,9 @@ def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
                     corners.append((limit[first + start, 0], limit[first + stop - 1, 1], border[j], border[j + 1]))
     if corners:
         boxes = [Path([(a, c), (b, c), (b, d), (a, d), (a, c)], closed=True) for a, b, c, d in corners]
-        ax.add_patch(PathPatch(Path.make_compound_path(*boxes), fc="none", ec=MUTED, hatch="///", lw=0.6))
+        # Outlines help where there is room for them, and would fill narrow columns.
+        outline = 0.6 if len(boxes) < 150 else 0.0
+        ax.add_patch(PathPatch(Path.make_compound_path(*boxes), fc="none", ec=MUTED, hatch="///", lw=outline))
     ax.set_ylim(min(edges(d)[0] for d in products), max(edges(d)[-1] for d in products))
     ax.set_ylabel("distance from the pupil z (m)")
     time_axis(ax, products)
@@ -164,7 +211,7 @@ def cn2_scale(datasets: Sequence[Dataset]) -> tuple[float, float] | None:
 
 def compose_time_distance(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out the figure of the time-distance map."""
-    draw_time_distance(figure.add_axes((0.1, 0.15, 0.83, 0.67)), datasets)
+    draw_time_distance(_frame(figure, datasets, [3.3], right=0.75)[0], datasets)
 
 
 def describe_time_distance(datasets: Sequence[Dataset]) -> str:
@@ -192,11 +239,16 @@ def _follow(ax: Axes, line: Series | None, label: str, **style: object) -> None:
     if line is not None and np.isfinite(line.values).any():
         if line.values.size > MARKED:
             style["marker"] = ""
+        elif line.values.size <= SPANNED:
+            ax.hlines(line.values, line.days - line.half, line.days + line.half, color=style["color"], lw=1.2)  # type: ignore[arg-type]
         ax.plot(line.days, line.values, label=label, **style)  # type: ignore[arg-type]
 
 
 def _from_zero(ax: Axes, *lines: Series | None) -> None:
-    top = max((float(np.nanmax(line.values)) for line in lines if line is not None and np.isfinite(line.values).any()), default=1)
+    top = max(
+        (float(np.nanmax(line.values)) for line in lines if line is not None and np.isfinite(line.values).any()),
+        default=1,
+    )
     ax.set_ylim(0, 1.12 * top if top > 0 else 1)
     ax.grid(axis="y")
 
@@ -216,13 +268,14 @@ def draw_fried_parameter(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axe
 
 def _draw_pair(ax: Axes, products: list[Dataset], name: str, label: str, factor: float) -> Axes:
     lines: list[Series | None] = []
-    for component, (marker, colour, dashes) in enumerate(_SOURCES):
+    for component, source in enumerate(source_names(products)):
+        marker, colour, dashes = _SOURCES[component % len(_SOURCES)]
         line = series(products, f"{name}_direct", component)
-        line = None if line is None else Series(line.days, factor * line.values)
+        line = None if line is None else line.mapped(lambda values: factor * values)
         lines.append(line)
-        _follow(ax, line, f"direct, source {component + 1}", color=colour, marker=marker, mfc=PAPER, ls=dashes, lw=1.6)
+        _follow(ax, line, f"direct, {source}", color=colour, marker=marker, mfc=PAPER, ls=dashes, lw=1.6)
     line = series(products, f"{name}_profile")
-    line = None if line is None else Series(line.days, factor * line.values)
+    line = None if line is None else line.mapped(lambda values: factor * values)
     lines.append(line)
     _follow(ax, line, "from the profile", color=BLUE, marker="D", ls="-", ms=5)
     _from_zero(ax, *lines)
@@ -232,26 +285,30 @@ def _draw_pair(ax: Axes, products: list[Dataset], name: str, label: str, factor:
 
 def compose_strength(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out scintillation index and Fried parameter over time."""
-    above = draw_scintillation(figure.add_axes((0.1, 0.53, 0.885, 0.31)), datasets)
-    below = draw_fried_parameter(figure.add_axes((0.1, 0.1, 0.885, 0.36)), datasets)
-    time_axis(above, datasets, local=False, labels=False)
-    above.set_xlabel("")
-    for child in below.child_axes:
-        child.set_visible(False)
+    above, below = _frame(figure, datasets, [1.9, 1.9], head=0.3)
+    draw_scintillation(above, datasets)
+    draw_fried_parameter(below, datasets)
+    _join((above, below))
     handles = {}
     for ax in (above, below):
         handles.update(dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True)))
-    figure.legend(list(handles.values()), list(handles), loc="upper left", bbox_to_anchor=(0.09, 1.0), ncol=3)
+    figure.legend(
+        list(handles.values()), list(handles), loc="upper left", bbox_to_anchor=(0.09, 1.0), ncol=3, borderaxespad=0.1
+    )
 
 
 def describe_strength(datasets: Sequence[Dataset]) -> str:
     """Say the median of each number and the relative difference of direct and retrieved ones."""
     parts = []
-    for name, words, factor, unit in (("scintillation_index", "Scintillation index", 1, ""), ("r0", "Fried parameter", 100, " cm")):
+    for name, words, factor, unit in (
+        ("scintillation_index", "Scintillation index", 1, ""),
+        ("r0", "Fried parameter", 100, " cm"),
+    ):
         direct, profile = series(datasets, f"{name}_direct"), series(datasets, f"{name}_profile")
         if profile is None or not np.isfinite(profile.values).any():
             continue
-        text = f"{words} from the profile: median {number(factor * float(np.nanmedian(profile.values)), 3)}{unit}"
+        middle = "median " if np.isfinite(profile.values).sum() > 1 else ""
+        text = f"{words} from the profile: {middle}{number(factor * float(np.nanmedian(profile.values)), 3)}{unit}"
         if direct is not None and direct.values.size == profile.values.size and np.isfinite(direct.values).any():
             with np.errstate(divide="ignore", invalid="ignore"):
                 relative = 100 * (profile.values / direct.values - 1)
@@ -290,14 +347,11 @@ def draw_log_mu(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     products = listed(datasets)
     line = series(products, "mu")
     if line is not None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            exponent = np.log10(line.values)
-        _follow(ax, Series(line.days, np.where(np.isfinite(exponent), exponent, np.nan)), "log mu", color=PURPLE, marker="s",
-                ls="-", ms=5)  # fmt: skip
+        _follow(ax, line.mapped(np.log10), "log mu", color=PURPLE, marker="s", ls="-", ms=5)
     low, high = ax.get_ylim()
     if high - low < 2:
         ax.set_ylim((low + high) / 2 - 1, (low + high) / 2 + 1)
-    ax.yaxis.set_major_formatter(lambda value, _: number(value, 4).rstrip("0").rstrip("."))
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:.4g}")
     ax.grid(axis="y")
     ax.set_ylabel(r"$\log_{10}\,\mu$")
     return time_axis(ax, products)
@@ -305,12 +359,10 @@ def draw_log_mu(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
 
 def compose_fit(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out chi2 and log mu over time."""
-    above = draw_chi2(figure.add_axes((0.1, 0.54, 0.885, 0.29)), datasets)
-    below = draw_log_mu(figure.add_axes((0.1, 0.13, 0.885, 0.33)), datasets)
-    time_axis(above, datasets, local=False, labels=False)
-    above.set_xlabel("")
-    for child in below.child_axes:
-        child.set_visible(False)
+    above, below = _frame(figure, datasets, [1.5, 1.5])
+    draw_chi2(above, datasets)
+    draw_log_mu(below, datasets)
+    _join((above, below))
 
 
 def describe_fit(datasets: Sequence[Dataset]) -> str:
@@ -324,12 +376,13 @@ def describe_fit(datasets: Sequence[Dataset]) -> str:
             found = np.log10(line.values) if name == "mu" else line.values
         found = found[np.isfinite(found)]
         if found.size:
-            parts.append(f"{words}: median {number(float(np.median(found)), 3)}, from {number(float(found.min()), 3)} to {number(float(found.max()), 3)}")
+            low, middle, high = (number(float(value), 3) for value in (found.min(), np.median(found), found.max()))
+            parts.append(f"{words}: {middle}" if found.size == 1 else f"{words}: median {middle}, from {low} to {high}")
     return "; ".join(parts) + "." if parts else "No batch has these numbers."
 
 
 def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
-    """Draw when each quality flag was raised: a row per flag, with how often at its right end."""
+    """Draw when each quality flag was raised: a row per flag, named with how often."""
     products = listed(datasets)
     limit = np.concatenate([bounds(dataset) for dataset in products]) / DAY
     raised = np.concatenate([flags(dataset) for dataset in products])
@@ -337,7 +390,7 @@ def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     limit, raised = limit[order], raised[order]
     start, stop = span(products)
     least = 0.004 * (stop - start) / DAY
-    names = list(QUALITY_FLAGS)
+    names, words = list(QUALITY_FLAGS), []
     for row, name in enumerate(names):
         bit, level, _ = QUALITY_FLAGS[name]
         here = (raised & bit) > 0
@@ -350,18 +403,16 @@ def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
         if bars:
             ax.broken_barh(bars, (row - 0.32, 0.64), fc=RED if level == 2 else BLUE, ec=INK, lw=0.6,
                            hatch="xxx" if level == 2 else "")  # fmt: skip
-        ax.annotate(str(int(here.sum())), (1, row), xycoords=("axes fraction", "data"), xytext=(10, 0),
-                    textcoords="offset points", va="center", weight="bold" if here.any() else "normal")  # fmt: skip
+        words.append(f"{name.replace('_', ' ')} ({int(here.sum())})")
     ax.set_ylim(len(names) - 0.5, -0.6)
-    ax.set_yticks(range(len(names)), [name.replace("_", " ") for name in names])
+    ax.set_yticks(range(len(names)), words)
     ax.tick_params(axis="y", length=0)
-    ax.annotate("batches", (1, 1), xycoords="axes fraction", xytext=(-6, 3), textcoords="offset points", fontsize=11)
     return time_axis(ax, products)
 
 
 def compose_quality(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out the quality flags over time."""
-    draw_quality(figure.add_axes((0.205, 0.16, 0.725, 0.65)), datasets)
+    draw_quality(_frame(figure, datasets, [0.32 * len(QUALITY_FLAGS)], left=2.45)[0], datasets)
 
 
 def describe_quality(datasets: Sequence[Dataset]) -> str:
@@ -370,6 +421,11 @@ def describe_quality(datasets: Sequence[Dataset]) -> str:
     raised = np.concatenate([flags(dataset) for dataset in datasets])
     counts = ", ".join(f"{int((level == i).sum())} {word}" for i, word in enumerate(LEVELS))
     often = [
-        f"{name} {int(((raised & (1 << i)) > 0).sum())}" for i in range(31) for name in flag_names(1 << i) if ((raised & (1 << i)) > 0).any()
+        f"{name} {int(((raised & (1 << i)) > 0).sum())}"
+        for i in range(31)
+        for name in flag_names(1 << i)
+        if ((raised & (1 << i)) > 0).any()
     ]
-    return f"Of {level.size} batches: {counts}. " + ("Flags: " + ", ".join(often) + "." if often else "No flag was raised.")
+    return f"Of {level.size} {'batch' if level.size == 1 else 'batches'}: {counts}. " + (
+        "Flags: " + ", ".join(often) + "." if often else "No flag was raised."
+    )
