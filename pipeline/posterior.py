@@ -55,8 +55,10 @@ SLACK = 0.02
 @njit(cache=True, nogil=True)
 def _truncated_normal(rng: np.random.Generator, low: float, high: float) -> float:
     """Standard normal variate in [low, high] by rejection (Robert 1995, https://doi.org/10.1007/BF00143942)."""
+    # Not by calling itself: numba crashes on recursive functions that it loads from its cache (numba issue 6061).
+    sign = 1.0
     if high < -0.5:
-        return -_truncated_normal(rng, -high, -low)  # type: ignore[no-any-return]
+        sign, low, high = -1.0, -high, -low
     if low > 0.5:
         rate = 0.5 * (low + math.sqrt(low * low + 4.0))
         span = high - low
@@ -64,12 +66,12 @@ def _truncated_normal(rng: np.random.Generator, low: float, high: float) -> floa
             while True:
                 x = low + span * rng.random()
                 if rng.random() <= math.exp(0.5 * (low * low - x * x)):
-                    return x
+                    return sign * x
         kept = 1.0 - math.exp(-rate * span)
         while True:
             x = low - math.log(1.0 - rng.random() * kept) / rate
             if x <= high and rng.random() <= math.exp(-0.5 * (x - rate) ** 2):
-                return x
+                return sign * x
     if high - low < 1.5:
         nearest = 0.0 if low < 0.0 < high else min(abs(low), abs(high))
         while True:
