@@ -1,8 +1,9 @@
 r"""Response functions: the correlation maps that a slice of turbulence with Cn2 dz = 1 prints on the data.
 
 A layer at distance z gives slopes and intensities through linear filters of its index fluctuations. With
-X = pi lambda z f^2 L / (L - z), m = z / (L - z), k = 2 pi / lambda, the aperture filter F, the source's transform P~ and the
-transform M_l of s_l P about its own centroid, the amplitude of one source is, in pupil frequencies f (cycles per m),
+X = pi lambda z f^2 L / (L - z), m = z / (L - z), k = 2 pi / lambda, the aperture filter F, the source's transform P~
+and the transform M_l of s_l P about its own centroid, the amplitude of one source is, in pupil frequencies f (cycles
+per m),
 
     slope along l    A_l = -2 pi i f_l F cos X conj(P~(m f)) + (2 k / L) F sin X conj(M_l(m f))
     scintillation    A_i = 2 k F sin X conj(P~(m f))
@@ -13,19 +14,22 @@ and the response at the separation d = r_a - r_b, a on the first source and b on
 
 with the separation s of the sources: the ridge of the cross maps lies at d = m s. These are Sauvage et al. 2021
 (https://doi.org/10.1364/AO.438170), Eqs. (8)-(16), for any two sources, with one term more: each point of an extended
-source scintillates on its own and is imaged at s / L, so the centroid also moves by the intensity-weighted mean of s / L.
-For a Gaussian source of standard deviation sigma_l the two slope terms are -2 pi i f_l F conj(P~) (cos X - (2 k m sigma_l^2 / L)
-sin X). `slope_response="printed"` leaves the second term out, as the paper does.
+source scintillates on its own and is imaged at s / L, so the centroid also moves by the intensity-weighted mean of
+s / L. For a Gaussian source of standard deviation sigma_l the two slope terms are
+-2 pi i f_l F conj(P~) (cos X - (2 k m sigma_l^2 / L) sin X). `slope_response="printed"` leaves the second term out, as
+the paper does.
 
 Near f = 0 the slope integrand goes as f^(-5/3): no grid that is uniform in f holds it. The integral is taken in polar
 coordinates, over shells of geometrically growing radius with Gauss-Legendre panels in u = f^(1/3), in which that
 singularity is gone, and the trapezoidal rule in angle, which converges exponentially. Orders follow from the phase
-that the widest separation, shift, aperture, source and diffraction give the integrand; shells are added until
-the maps no longer move. Slice means use Gauss-Kronrod panels along z, halved where their two rules disagree.
+that the widest separation, shift, aperture, source and diffraction give the integrand, and are checked against finer
+ones in every slice; shells are added until the maps no longer move. Slice means use nested Gauss rules along z, on
+panels that are halved where two rules disagree.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from functools import lru_cache
@@ -51,31 +55,30 @@ SlopeResponse = Literal["centroid", "printed"]
 Aperture = Literal["square", "circular"]
 Tilt = Literal["gradient", "zernike"]
 
-#: Relative change, of each map's maximum, at which shells and panels stop; the maps are then good to about 1e-6.
-TOLERANCE = 2e-7
+#: Error of each map, relative to its maximum, that shells of frequencies and panels along z may leave.
+TOLERANCE = 5e-7
 
-#: Nodes per radian of phase in radius, and spare angles, at resolution 1 (see `_shells`).
+#: Nodes per radian of phase in radius (see `_shells`), growth of the shells, nodes that fit the cache.
 _NODES_PER_RADIAN = 0.42
 _SHELL_RATIO = math.sqrt(2.0)
 _MAX_SHELLS = 90
 _CHUNK = 8192
 
-#: Kronrod's extension of the 5-point Gauss-Legendre rule to 11 points: nodes, weights, and Gauss weights.
-_KRONROD_HALF = (
-    (0.0, 0.282987417857491213, 0.568888888888888889),
-    (0.279630413161783193, 0.272849801912558922, 0.0),
-    (0.538469310105683091, 0.241040339228647587, 0.478628670499366468),
-    (0.754166726570849220, 0.186800796556492657, 0.0),
-    (0.906179845938663993, 0.115233316622473394, 0.236926885056189088),
-    (0.984085360094842464, 0.042582036751081833, 0.0),
+#: Nested rules of 3, 7 and 15 points: Gauss-Legendre with the extensions of Kronrod and Patterson 1968
+#: (https://doi.org/10.1090/S0025-5718-68-99866-9). Columns: node and its weight in each rule, for nodes of 0 and more.
+_NESTED_HALF = (
+    (0.000000000000000000, 0.888888888888888889, 0.450916538658474142, 0.225510499798206687),
+    (0.223386686428966882, 0.000000000000000000, 0.000000000000000000, 0.219156858401587496),
+    (0.434243749346802558, 0.000000000000000000, 0.401397414775962223, 0.200628529376989021),
+    (0.621102946737226403, 0.000000000000000000, 0.000000000000000000, 0.171511909136391381),
+    (0.774596669241483377, 0.555555555555555556, 0.268488089868333441, 0.134415255243784220),
+    (0.888459232872256999, 0.000000000000000000, 0.000000000000000000, 0.092927195315124538),
+    (0.960491268708020283, 0.000000000000000000, 0.104656226026467265, 0.051603282997079740),
+    (0.993831963212755022, 0.000000000000000000, 0.000000000000000000, 0.017001719629940260),
 )
-_NODES = np.array([-x for x, _, _ in _KRONROD_HALF[:0:-1]] + [x for x, _, _ in _KRONROD_HALF])
-_RULES = np.array(
-    [
-        [w for _, w, _ in _KRONROD_HALF[:0:-1]] + [w for _, w, _ in _KRONROD_HALF],
-        [w for _, _, w in _KRONROD_HALF[:0:-1]] + [w for _, _, w in _KRONROD_HALF],
-    ]
-)
+_NESTED = np.array([(-x, *w) for x, *w in _NESTED_HALF[:0:-1]] + [*_NESTED_HALF])
+_NODES, _RULES = _NESTED[:, 0], _NESTED[:, 1:].T
+_FIRST, _SECOND = slice(1, None, 2), slice(0, None, 2)
 
 #: Blocks of the data vector that a pass over the frequencies fills.
 _AUTO = tuple(MAP_KINDS.index(kind) for kind in ("xx_auto", "yy_auto", "ii_auto"))
@@ -134,7 +137,7 @@ def response_matrix(
         raise ValueError(f"a slice ends at {grid.edges[-1]:g} m, beyond the sources at {geometry.path_length:g} m")
     model = _model(geometry, spectrum, sources, slope_response, aperture, tilt)
     columns = []
-    for z0, z1 in zip(grid.edges[:-1], grid.edges[1:], strict=True):
+    for z0, z1 in itertools.pairwise(grid.edges):
         if sampling == "midpoint":
             maps = (z1 - z0) * _at(model, (z0 + z1) / 2)
         else:
@@ -192,6 +195,7 @@ class _Model:
     aperture: Aperture
     tilt: Tilt
     power: float  # n in f = u^n
+    even: bool  # sources symmetric about both axes: a quadrant of frequencies tells all
 
     @property
     def wavenumber(self) -> float:
@@ -234,6 +238,7 @@ def _model(
         aperture,  # type: ignore[arg-type]
         tilt,  # type: ignore[arg-type]
         _radial_power(spectrum),
+        all(_is_even(source) for source in kept),
     )
 
 
@@ -252,8 +257,15 @@ def _extent(source: SourceModel) -> tuple[float, float]:
     return half[0], half[1]
 
 
+def _is_even(source: SourceModel) -> bool:
+    """Whether a source is symmetric about the x and the y axis, from its transform at scattered frequencies."""
+    scatter = np.random.default_rng(1).standard_normal((2, 64)) * np.logspace(-3, 6, 64)
+    values = [source.transfer(i * scatter[0], j * scatter[1]) for i, j in ((1, 1), (-1, 1), (1, -1))]
+    return all(bool(np.all(np.abs(value - np.real(values[0])) < 1e-14)) for value in values)
+
+
 def _radial_power(spectrum: TurbulenceSpectrum) -> float:
-    """n in f = u^n that leaves no singularity at zero: 3 for S_n ~ f^(-11/3), more for steeper spectra."""
+    """Power n in f = u^n that leaves no singularity at zero: 3 for S_n ~ f^(-11/3), more for steeper spectra."""
     psd = spectrum.psd(np.array([1e-9, 1e-8]))
     slope = math.log10(psd[1] / psd[0])
     if slope <= -4:
@@ -262,61 +274,85 @@ def _radial_power(spectrum: TurbulenceSpectrum) -> float:
 
 
 def _slice_integral(model: _Model, z0: float, z1: float) -> Array:
-    """Integral of W over one slice, (6, 2p - 1, 2q - 1), halving panels until both rules agree."""
-    edges = _panel_edges(model.geometry, z0, z1)
+    """Integral of W over one slice, (6, 2p - 1, 2q - 1), halving panels until their rules agree."""
     resolution = _resolution(model, (z0 + z1) / 2)
-    panels = []
+    edges = _panel_edges(model, z0, z1)
+    # Wide panels first: what is added later needs no accuracy of its own.
+    waiting = sorted(itertools.pairwise(edges), key=lambda panel: panel[1] - panel[0])
+    done: list[tuple[float, float, Array, Array]] = []
     total = np.zeros((6, *model.geometry.map_shape))
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
-        maps, error = _panel(model, a, b, np.abs(total).max(axis=(1, 2)), resolution)
-        panels.append((a, b, maps, error))
-        total += maps
-    for _ in range(24):
-        size = np.maximum(np.abs(total).max(axis=(1, 2)), np.finfo(float).tiny)
-        errors = np.array([error for *_, error in panels]) / size
+    for _ in range(64):
+        while waiting:
+            a, b = waiting.pop()
+            maps, error = _panel(model, a, b, (b - a) / (z1 - z0) * _sizes(total), resolution)
+            done.append((a, b, maps, error))
+            total = total + maps
+        errors = np.array([error for *_, error in done]) / _sizes(total)
         if np.all(errors.sum(axis=0) <= TOLERANCE):
             break
-        a, b, maps, _ = panels.pop(int(np.argmax(errors.max(axis=1))))
+        a, b, maps, _ = done.pop(int(np.argmax(errors.max(axis=1))))
         total = total - maps
-        for c, d in ((a, (a + b) / 2), ((a + b) / 2, b)):
-            maps, error = _panel(model, c, d, size, resolution)
-            panels.append((c, d, maps, error))
-            total = total + maps
+        waiting = [(a, (a + b) / 2), ((a + b) / 2, b)]
     if model.geometry.n_sources == 1:
         total[list(_CROSS)] = np.nan
     return total
 
 
-def _panel_edges(geometry: Geometry, z0: float, z1: float) -> list[float]:
+def _sizes(maps: Array, floor: Array | float = 0.0) -> Array:
+    """Largest absolute value of each kind, (6,), at least `floor` and above zero."""
+    return np.asarray(np.maximum(np.maximum(np.abs(maps).max(axis=(1, 2)), floor), np.finfo(float).tiny))
+
+
+def _panel_edges(model: _Model, z0: float, z1: float) -> list[float]:
     """Borders of the panels along z: the slice, cut where the shift m s passes a multiple of d.
 
-    There the edges of the two subapertures coincide, and the cross maps have a kink in z near the pupil, where
-    the source does not blur it.
+    There the edges of the two subapertures coincide, and the cross maps have a kink in z, as long as the source
+    does not blur it. Where it does not blur the diffraction of the edges either, the panels are shorter from the start.
     """
-    cuts = {z0, z1}
+    geometry = model.geometry
+    d = geometry.subaperture_size
+    blur = geometry.magnification((z0 + z1) / 2) * max(model.extent)
+    pieces = min(4, math.ceil(d / (3 * blur))) if blur else 4
+    cuts = set(np.linspace(z0, z1, pieces + 1).tolist())
     for s, n in zip(geometry.separation, (geometry.q, geometry.p), strict=True):
         for step in range(1, n + 1):
-            if s:
-                m = step * geometry.subaperture_size / abs(s)
-                z = m if geometry.infinite else geometry.path_length * m / (1 + m)
-                # A sliver of a panel costs as much as a whole one.
-                if z0 + 0.01 * (z1 - z0) < z < z1 - 0.01 * (z1 - z0):
-                    cuts.add(z)
-    return sorted(cuts)
+            m = step * d / abs(s) if s else math.inf
+            if m * max(model.extent) > d / 8:
+                break
+            z = m if geometry.infinite else geometry.path_length * m / (1 + m)
+            if z0 < z < z1:
+                cuts.add(z)
+    # A sliver of a panel costs as much as a whole one.
+    edges = sorted(cuts)
+    kept = [a for a, b in itertools.pairwise(edges) if b - a > 0.01 * (z1 - z0)]
+    return [z0, *kept[1:], z1]
 
 
 def _panel(model: _Model, z0: float, z1: float, floor: Array, resolution: float) -> tuple[Array, Array]:
     """Integral of W over [z0, z1], (6, 2p - 1, 2q - 1), and the error of each kind, (6,)."""
     z = (z0 + z1) / 2 + (z1 - z0) / 2 * _NODES
     rules = (z1 - z0) / 2 * _RULES
-    both = np.zeros((2, 6, *model.geometry.map_shape))
+    three, seven, fifteen = _layers(model, z[_FIRST], rules[:, _FIRST], floor, resolution)
+    first = np.abs(seven - three).max(axis=(1, 2))
+    # The difference is the error of the shorter rule; the power 3/2 for that of the longer one is QUADPACK's.
+    error = first * np.minimum(1.0, np.sqrt(2e4 * first / _sizes(seven, floor)))
+    if np.all(error <= TOLERANCE / 2 * _sizes(seven, floor)):
+        return seven, error
+    fifteen = fifteen + _layers(model, z[_SECOND], rules[2:, _SECOND], _sizes(seven, floor), resolution)[0]
+    last = np.abs(fifteen - seven).max(axis=(1, 2))
+    # Diffraction by the edges oscillates in z near the pupil, and gains only a factor of ten there; 1e-9 elsewhere.
+    return fifteen, last / 10
+
+
+def _layers(model: _Model, z: Array, rules: Array, floor: Array, resolution: float) -> Array:
+    """Weighted sums of W over layers, (rules, 6, 2p - 1, 2q - 1)."""
+    maps = np.zeros((len(rules), 6, *model.geometry.map_shape))
     for first, last in _groups(model.geometry, z):
-        size = np.maximum(floor, np.abs(both[0]).max(axis=(1, 2)))
-        both += _maps(model, z[first:last], rules[:, first:last], size, resolution)
-    difference = np.abs(both[0] - both[1]).max(axis=(1, 2))
-    size = np.maximum(np.maximum(floor, np.abs(both[0]).max(axis=(1, 2))), np.finfo(float).tiny)
-    # The rules differ by the error of the shorter one; the longer one is better by QUADPACK's power of it.
-    return both[0], difference * np.minimum(1.0, np.sqrt(200 * difference / size))
+        # Each run of layers may leave its share of the error that the sum of all of them may.
+        share = float(rules[-1, first:last].sum() / rules[-1].sum())
+        allowance = share * _sizes(maps[-1], floor)
+        maps += _maps(model, z[first:last], rules[:, first:last], allowance, resolution)
+    return maps
 
 
 def _groups(geometry: Geometry, z: Array) -> Iterator[tuple[int, int]]:
@@ -349,7 +385,7 @@ def _resolution(model: _Model, z: float) -> float:
     for _ in range(6):
         finer = _maps(model, np.array([z]), rule, floor, 4 / 3 * resolution)[0]
         size = np.abs(finer).max(axis=(1, 2))
-        if np.all(np.abs(finer - maps).max(axis=(1, 2)) <= 2 * TOLERANCE * size):
+        if np.all(np.abs(finer - maps).max(axis=(1, 2)) <= TOLERANCE * size):
             return resolution
         resolution, maps = 4 / 3 * resolution, finer
     raise ArithmeticError(f"the response at {z:g} m does not converge: the source or the spectrum is too structured")
@@ -389,7 +425,7 @@ def _legendre(n: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Shell:
-    """Nodes of one shell: radii (n,), weights of dr (n,), angles of the half circle (m,), and the taper (n,)."""
+    """Nodes of one shell: radii (n,), weights of dr (n,), angles (m,) of a quadrant or the half circle, taper (n,)."""
 
     f: Array
     weight: Array
@@ -411,13 +447,13 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
     def phase(f: float) -> float:
         return swing * f + bend * f * f
 
-    start = min(0.5 / swing, 0.5 / math.sqrt(bend) if bend else math.inf)
+    start = min(3 / swing, 1 / math.sqrt(bend) if bend else math.inf)
     edges = [0.0] + [start * 8.0**-level for level in range(4, 0, -1)]
     outer = start
     for _ in range(_MAX_SHELLS):
         edges.append(outer)
         radii, weights, inner = [], [], edges[0]
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in itertools.pairwise(edges):
             panels = max(1, math.ceil((phase(b) - phase(a)) / 60))
             nodes, rule = _legendre(math.ceil(resolution * (_NODES_PER_RADIAN * (phase(b) - phase(a)) / panels + 8)))
             cuts = np.linspace(a, b, panels + 1) ** (1 / model.power)
@@ -428,40 +464,38 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
         f = np.concatenate(radii)
         x = np.clip((f - inner) / (outer - inner), 0, 1)
         turn = swing * outer
-        angles = math.ceil(resolution * (turn + 8 * turn ** (1 / 3) + 16) / 2)
-        angle = np.pi * (np.arange(angles) + 0.5) / angles
+        span = np.pi / 2 if model.even else np.pi
+        angles = math.ceil(resolution * (turn + 8 * turn ** (1 / 3) + 16) * span / (2 * np.pi))
+        angle = span * (np.arange(angles) + 0.5) / angles
         # Smooth to the fourth derivative: a sharp edge would ring in the maps of far separations.
         yield _Shell(f, np.concatenate(weights), angle, 1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3))
         edges, outer = [outer], outer * _SHELL_RATIO
 
 
-def _integrate(
-    model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], floor: Array, resolution: float
-) -> Array:
+def _integrate(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], floor: Array, resolution: float) -> Array:
     """Maps of the given kinds, (rules, kinds, 2p - 1, 2q - 1), adding shells until they stand still."""
     crossed = kinds[-1] in _CROSS
-    total = 0.0
-    before: Array | None = None
-    estimate: Array | None = None
-    change: Array | None = None
-    calm = 0
+    total: Array | float = 0.0
+    before = change = estimate = None
     for shell in _shells(model, z, _reach(model, z, crossed), resolution):
         whole, tapered = _shell_maps(model, z, rules, kinds, shell)
         ended = total + tapered
         total = total + whole
-        if before is None:
-            before = ended
-            continue
-        step = ended - before
-        # Without a source to blur it, the integrand falls as a power of f: continue it as the geometric series
-        # that the last two shells begin.
-        latest = ended + _rest(step, change)
-        if estimate is not None:
-            size = np.maximum(np.abs(latest[0]).max(axis=(1, 2)), floor)
-            calm = calm + 1 if np.all(np.abs(latest[0] - estimate[0]).max(axis=(1, 2)) <= TOLERANCE * size) else 0
-            if calm == 2:
-                return np.asarray(latest)
-        before, change, estimate = ended, step, latest
+        if before is not None:
+            step = ended - before
+            # Without a source to blur it, the integrand falls as a power of f: what is left continues, in good
+            # approximation, the geometric series that the last two shells begin.
+            rest = _rest(step, change)
+            latest = ended + rest
+            if estimate is not None:
+                largest = np.abs(latest[-1]).max(axis=(1, 2))
+                # The rest is known to a third or better, so it may be twice what it may leave.
+                allowed = 2 * TOLERANCE * np.maximum(largest, floor)
+                moved = np.abs(latest[-1] - estimate[-1]).max(axis=(1, 2))
+                if np.all(moved <= allowed) and np.all(np.abs(rest[-1]).max(axis=(1, 2)) <= allowed):
+                    return latest
+            change, estimate = step, latest
+        before = ended
     raise ArithmeticError("the response does not converge: the spectrum does not decay toward high frequencies")
 
 
@@ -478,56 +512,44 @@ def _rest(step: Array, change: Array | None) -> Array:
     return np.asarray((flat * ratio / (1 - ratio)).reshape(step.shape))
 
 
-def _shell_maps(
-    model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], shell: _Shell
-) -> tuple[Array, Array]:
+#: Sums that make a map: products of the cosine or sine along y and along x; sines are odd in the separation.
+_COS_COS, _SIN_SIN, _SIN_COS, _COS_SIN = range(4)
+
+
+def _shell_maps(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], shell: _Shell) -> tuple[Array, Array]:
     """Contribution of one shell, whole and tapered, each (rules, kinds, 2p - 1, 2q - 1)."""
-    geometry = model.geometry
-    p, q = geometry.p, geometry.q
-    crossed = kinds[-1] in _CROSS
-    own = kinds[0] in _AUTO
+    p, q, d = model.geometry.p, model.geometry.q, model.geometry.subaperture_size
     rows = max(1, _CHUNK // shell.angle.size)
-    sums = np.zeros((2, (2 if crossed else 1), len(rules), len(kinds), 4, p, q))
     cosine, sine = np.cos(shell.angle), np.sin(shell.angle)
     radial = _radial(model, z, shell)
+    sums = np.zeros((4, 2, len(rules), len(kinds), p, q))
     for first in range(0, shell.f.size, rows):
         part = slice(first, first + rows)
         f = shell.f[part, None]
         fx, fy = f * cosine, f * sine
-        density = _densities(model, z, fx, fy, tuple(values[:, part, None] for values in radial), own, crossed)
-        # (layers, parts, kinds, radii, angles) -> (rules, ...)
-        density = np.tensordot(rules, density, axes=1)
-        tapered = density * shell.taper[part, None]
-        cx, sx = _harmonics(fx.ravel(), geometry.subaperture_size, q)
-        cy, sy = _harmonics(fy.ravel(), geometry.subaperture_size, p)
-        for number, values in enumerate((density, tapered)):
-            flat = np.moveaxis(values.reshape(*values.shape[:3], -1), 1, 0)
-            left_c = (flat[..., None, :] * cy).reshape(-1, fx.size)
-            left_s = (flat[..., None, :] * sy).reshape(-1, fx.size)
-            shape = (flat.shape[0], len(rules), len(kinds), p, q)
-            products = [left_c @ cx.T, left_s @ sx.T]
-            if crossed:
-                products += [left_s @ cx.T, left_c @ sx.T]
-            for place, product in enumerate(products):
-                sums[number, :, :, :, place] += product.reshape(shape)
-    return _unfold(sums[0]), _unfold(sums[1])
-
-
-def _unfold(sums: Array) -> Array:
-    """Maps over all separations from the sums over cosines and sines of the non-negative ones.
-
-    `sums` is (part, rules, kinds, 4, p, q): real and imaginary part of the density times cos cos, sin sin, sin(y) cos(x),
-    cos(y) sin(x). The map is Re of the density times exp(i a_x + i a_y), and sines are odd in the separation.
-    """
-    p, q = sums.shape[-2:]
+        along_x, along_y = _harmonics(fx.ravel(), d, q), _harmonics(fy.ravel(), d, p)
+        densities = _densities(model, z, fx, fy, tuple(values[:, part, None] for values in radial), kinds)
+        basis: dict[int, Array] = {}
+        for block, products, density in densities:
+            # (layers, kinds, radii, angles) -> (whole or tapered, rules, kinds, nodes)
+            weighed = np.tensordot(rules, density, axes=1)
+            pair = np.stack([weighed, weighed * shell.taper[part, None]])
+            shape = (2, len(rules), density.shape[1], p, q)
+            pair = pair.reshape(-1, fx.size)
+            for product, sign in products:
+                if product not in basis:
+                    y = along_y[product in (_SIN_SIN, _SIN_COS)][:, None]
+                    x = along_x[product in (_SIN_SIN, _COS_SIN)]
+                    basis[product] = (y * x).reshape(p * q, -1)
+                sums[product][:, :, block] += sign * (pair @ basis[product].T).reshape(shape)
     dy, dx = np.arange(1 - p, p), np.arange(1 - q, q)
-    take = np.ix_(np.abs(dy), np.abs(dx))
-    odd_y, odd_x = np.sign(dy)[:, None], np.sign(dx)[None, :]
-    cc, ss, sc, cs = (sums[..., place, :, :][..., take[0], take[1]] for place in range(4))
-    maps = cc[0] - odd_y * odd_x * ss[0]
-    if len(sums) == 2:
-        maps = maps - odd_y * sc[1] - odd_x * cs[1]
-    return np.asarray(maps)
+    rows_, columns = np.ix_(np.abs(dy), np.abs(dx))
+    odd_y, odd_x = np.sign(dy)[:, None], np.sign(dx)
+    every = sums[..., rows_, columns]
+    whole, tapered = (
+        every[_COS_COS] + odd_y * odd_x * every[_SIN_SIN] + odd_y * every[_SIN_COS] + odd_x * every[_COS_SIN]
+    )
+    return whole, tapered
 
 
 def _harmonics(f: Array, d: float, n: int) -> tuple[Array, Array]:
@@ -543,7 +565,7 @@ def _radial(model: _Model, z: Array, shell: _Shell) -> tuple[Array, Array, Array
     """Weighted index spectrum, cos X and sin X of every layer and radius, (layers, radii) each."""
     scaling = np.array([model.geometry.scaling(float(a)) for a in z])[:, None]
     x = np.pi * model.geometry.wavelength * z[:, None] * scaling * shell.f**2
-    # The half circle stands for the whole one, whose other half holds the complex conjugate.
+    # The rest of the circle holds the same values, or their complex conjugates.
     measure = shell.weight * shell.f * (2 * np.pi / shell.angle.size)
     spectrum = np.stack([model.spectrum.psd(float(a) * shell.f) for a in scaling[:, 0]])
     return scaling**2 * spectrum * measure, np.cos(x), np.sin(x)
@@ -561,7 +583,9 @@ def _aperture(model: _Model, fx: Array, fy: Array) -> tuple[Array, Array, Array]
         return mean, 6 / d * _spherical_j1(np.pi * d * fx) * ay, 6 / d * ax * _spherical_j1(np.pi * d * fy)
     w = np.pi * d * np.hypot(fx, fy)
     mean = np.where(w < 1e-6, 1.0, 2 * j1(w) / np.maximum(w, 1e-300))
-    tilt = mean if model.tilt == "gradient" else np.where(w < 1e-3, 1 - w**2 / 12, 8 * jv(2, w) / np.maximum(w, 1e-3) ** 2)
+    tilt = mean
+    if model.tilt == "zernike":
+        tilt = np.where(w < 1e-3, 1 - w**2 / 12, 8 * jv(2, w) / np.maximum(w, 1e-3) ** 2)
     return mean, 2 * np.pi * fx * tilt, 2 * np.pi * fy * tilt
 
 
@@ -571,63 +595,85 @@ def _spherical_j1(x: Array) -> Array:
     return np.where(small, x / 3 * (1 - x**2 / 10), (np.sin(safe) / safe - np.cos(safe)) / safe)
 
 
-def _real(values: NDArray[Any]) -> NDArray[Any]:
-    """The same numbers, real where they are: even sources then cost real arithmetic only."""
-    return values if not np.iscomplexobj(values) or values.imag.any() else values.real
+def _amplitudes(
+    model: _Model, m: float, fx: Array, fy: Array, filters: tuple[Array, Array, Array], c: Array, s: Array
+) -> list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]:
+    """Amplitudes of slopes x and y, times i, and of scintillation, for each source; real for even sources."""
+    mean, tilt_x, tilt_y = filters
+    amplitudes = []
+    for source, centroid in zip(model.sources, model.centroids, strict=True):
+        transfer = source.transfer(m * fx, m * fy)
+        transfer = np.real(transfer) if model.even else np.conj(transfer)
+        seen = c * transfer
+        slopes = [tilt_x * seen, tilt_y * seen]
+        if model.centroid_term:
+            bright = (model.centroid_term * s) * mean
+            for slope, moment, centre in zip(slopes, source.moment(m * fx, m * fy), centroid, strict=True):
+                # i conj(M), whose real part is the imaginary part of M.
+                about = np.imag(moment) if model.even else 1j * (np.conj(moment) - centre * transfer)
+                slope += bright * about
+        amplitudes.append((slopes[0], slopes[1], (2 * model.wavenumber * s) * mean * transfer))
+    return amplitudes
 
 
 def _densities(
-    model: _Model, z: Array, fx: Array, fy: Array, radial: tuple[Array, Array, Array], own: bool, crossed: bool
-) -> Array:
-    """Spectral density of each kind, (layers, parts, kinds, radii, angles).
+    model: _Model, z: Array, fx: Array, fy: Array, radial: tuple[Array, ...], kinds: tuple[int, ...]
+) -> list[tuple[slice, tuple[tuple[int, int], ...], Array]]:
+    """Spectral densities of the kinds: for each block of kinds the products it enters, with sign, and the density.
 
-    `own` asks for the auto kinds, `crossed` for the cross kinds; the parts are real and, with `crossed`, imaginary.
+    Densities are (layers, kinds, radii, angles). Over the half circle, a map is the real part of the sum of density
+    times exp(i a_x + i a_y); over a quadrant, of even sources, the sum of density times cos(a_x - b_x) cos(a_y - b_y),
+    with the phase a of the separation and b of the shift between the sources.
     """
     geometry = model.geometry
     spectrum, cos_x, sin_x = radial
-    mean, tilt_x, tilt_y = _aperture(model, fx, fy)
-    sx, sy = geometry.separation
-    turn = 2 * np.pi * (sx * fx + sy * fy) if crossed else fx
-    autos = 3 * own
-    out = np.zeros((z.size, 1 + crossed, autos + 3 * crossed, *fx.shape))
+    filters = _aperture(model, fx, fy)
+    crossed, own = kinds[-1] in _CROSS, kinds[0] in _AUTO
+    autos = np.empty((z.size, 3, *fx.shape)) if own else None
+    terms: dict[int, Array] = {}
+    phases = [2 * np.pi * s * f if s else None for s, f in zip(geometry.separation, (fx, fy), strict=True)]
     for layer, distance in enumerate(z):
         m = geometry.magnification(float(distance))
-        power, c, s = spectrum[layer], cos_x[layer], sin_x[layer]
-        amplitudes = []
-        for source, centroid in zip(model.sources, model.centroids, strict=True):
-            transfer = np.conj(_real(source.transfer(m * fx, m * fy)))
-            seen = c * transfer
-            ax, ay = tilt_x * seen, tilt_y * seen
-            if model.centroid_term:
-                # Of -i times the slope amplitude; see the module's first lines.
-                bright = (model.centroid_term * s) * mean
-                moments = source.moment(m * fx, m * fy)
-                for axis, (moment, centre) in enumerate(zip(moments, centroid, strict=True)):
-                    about = moment - centre * np.conj(transfer) if centre else moment
-                    term = bright * _real(1j * np.conj(about))
-                    if axis == 0:
-                        ax = ax + term
-                    else:
-                        ay = ay + term
-            amplitudes.append((ax, ay, (2 * model.wavenumber * s) * mean * transfer))
-        first, second = amplitudes[0], amplitudes[-1]
+        amplitudes = _amplitudes(model, m, fx, fy, filters, cos_x[layer], sin_x[layer])
+        power = spectrum[layer]
         for kind in range(3):
-            a, b = first[kind], second[kind]
-            if len(amplitudes) == 1:
-                even = power * (a * a if not np.iscomplexobj(a) else (a * a.conj()).real)
-            if own:
-                out[layer, 0, kind] = (
-                    even
-                    if len(amplitudes) == 1
-                    else power / 2 * ((a * np.conj(a)).real + (b * np.conj(b)).real)
-                )
+            a, b = amplitudes[0][kind], amplitudes[-1][kind]
+            both = power * (a * np.conj(b))
+            if autos is not None:
+                autos[layer, kind] = np.real(both) if a is b else power / 2 * (np.abs(a) ** 2 + np.abs(b) ** 2)
             if crossed:
-                shift_c, shift_s = (np.cos(m * turn), np.sin(m * turn)) if kind == 0 else (shift_c, shift_s)
-                if len(amplitudes) == 1:
-                    out[layer, 0, autos + kind] = even * shift_c
-                    out[layer, 1, autos + kind] = -even * shift_s
-                else:
-                    value = power * (a * np.conj(b)) * (shift_c - 1j * shift_s)
-                    out[layer, 0, autos + kind] = value.real
-                    out[layer, 1, autos + kind] = value.imag
-    return out
+                if kind == 0:
+                    turns = _turns(phases, m, model.even)
+                for product, turn in turns.items():
+                    values = terms.setdefault(product, np.empty((z.size, 3, *fx.shape)))
+                    if model.even:
+                        np.multiply(both, turn, out=values[layer, kind])
+                    else:
+                        shifted = both * turn
+                        values[layer, kind] = np.real(shifted) if product == _COS_COS else np.imag(shifted)
+    blocks: list[tuple[slice, tuple[tuple[int, int], ...], Array]] = []
+    if autos is not None:
+        blocks.append((slice(0, 3), ((_COS_COS, 1),) if model.even else ((_COS_COS, 1), (_SIN_SIN, -1)), autos))
+    crosses = slice(len(kinds) - 3, len(kinds))
+    if model.even:
+        blocks += [(crosses, ((product, 1),), values) for product, values in terms.items()]
+    elif crossed:
+        blocks.append((crosses, ((_COS_COS, 1), (_SIN_SIN, -1)), terms[_COS_COS]))
+        blocks.append((crosses, ((_SIN_COS, -1), (_COS_SIN, -1)), terms[_SIN_COS]))
+    return blocks
+
+
+def _turns(phases: list[Array | None], m: float, even: bool) -> dict[int, NDArray[Any]]:
+    """Factors of the density by the shift between the sources, for each product that they feed."""
+    if not even:
+        turn = np.exp(-1j * m * sum(phase for phase in phases if phase is not None))
+        return {_COS_COS: turn, _SIN_COS: turn}
+    x, y = (None if phase is None else (np.cos(m * phase), np.sin(m * phase)) for phase in phases)
+    if x is None or y is None:
+        turns: dict[int, NDArray[Any]] = {}
+        if y is not None:
+            turns |= {_COS_COS: y[0], _SIN_COS: y[1]}
+        if x is not None:
+            turns |= {_COS_COS: x[0], _COS_SIN: x[1]}
+        return turns
+    return {_COS_COS: x[0] * y[0], _SIN_COS: x[0] * y[1], _COS_SIN: x[1] * y[0], _SIN_SIN: x[1] * y[1]}

@@ -1,8 +1,8 @@
 """Intensity distributions of the sources.
 
 P(x, y) is normalised to 1 and has its centroid at the source's position. With the Fourier transform
-P~(f) = integral of P(s) exp(-2 pi i f.s), the transform of s_l P is (i / 2 pi) dP~/df_l. Extents are lengths, or angles for
-sources at infinity; frequencies are their reciprocals.
+P~(f) = integral of P(s) exp(-2 pi i f.s), the transform of s_l P is (i / 2 pi) dP~/df_l. Extents are lengths, or
+angles for sources at infinity; frequencies are their reciprocals.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def _sinc_moment(f: NDArray[np.float64], width: float) -> NDArray[np.float64]:
 class Gaussian(SourceModelBase):
     """Separable Gaussian.
 
-    P = exp(-x^2 / beta_x^2 - y^2 / beta_y^2) up to a factor, beta = FWHM / (2 sqrt(ln 2)); P~(f) = exp(-pi^2 beta_x^2 f_x^2
-    - pi^2 beta_y^2 f_y^2): Sauvage et al. 2021, https://doi.org/10.1364/AO.438170, text under Eq. (16). The
-    transform of s_l P is -i pi beta_l^2 f_l P~.
+    P = exp(-x^2 / beta_x^2 - y^2 / beta_y^2) up to a factor, beta = FWHM / (2 sqrt(ln 2)), and
+    P~(f) = exp(-pi^2 beta_x^2 f_x^2 - pi^2 beta_y^2 f_y^2): Sauvage et al. 2021, https://doi.org/10.1364/AO.438170,
+    text under Eq. (16). The transform of s_l P is -i pi beta_l^2 f_l P~.
     """
 
     name: ClassVar[str] = "gaussian"
@@ -109,8 +109,8 @@ class Disc(SourceModelBase):
 class Rectangle(SourceModelBase):
     """Uniform rectangle, such as the front glass of a halogen lamp.
 
-    P~(f) = sinc(pi f_x a) sinc(pi f_y b) with sinc(w) = sin(w) / w (Goodman, Introduction to Fourier Optics, rectangular
-    aperture). From sinc'(w) = -j1(w), the spherical Bessel function, the transform of x P is
+    P~(f) = sinc(pi f_x a) sinc(pi f_y b) with sinc(w) = sin(w) / w (Goodman, Introduction to Fourier Optics,
+    rectangular aperture). From sinc'(w) = -j1(w), the spherical Bessel function, the transform of x P is
     -i (a / 2) j1(pi f_x a) sinc(pi f_y b).
     """
 
@@ -135,8 +135,8 @@ class Rectangle(SourceModelBase):
 class Image(SourceModelBase):
     """Measured intensity map, piecewise constant on square pixels.
 
-    P~(f) = sinc(pi f_x h) sinc(pi f_y h) sum_ij I_ij exp(-2 pi i (f_x x_j + f_y y_i)) / sum_ij I_ij with pixels of side h: the
-    transform of a pixel times the sum over the pixels' centres, taken about the centroid of the map. The
+    P~(f) = sinc(pi f_x h) sinc(pi f_y h) sum_ij I_ij exp(-2 pi i (f_x x_j + f_y y_i)) / sum_ij I_ij with pixels of
+    side h: the transform of a pixel times the sum over the pixels' centres, taken about the centroid of the map. The
     transforms of x P and y P follow with x_j I_ij in the sum, and the moment of the pixel itself. The pixel
     values, not the name of their file, are part of the model's identity.
     """

@@ -86,8 +86,8 @@ class Tatarskii(TurbulenceSpectrumBase):
 class Hill(TurbulenceSpectrumBase):
     """Hill's bump before the inner scale, in the analytic form of Andrews.
 
-    S_n(f) = 0.033 (2 pi)^(-2/3) (f^2 + 1/L0^2)^(-11/6) [1 + 1.802 r - 0.254 r^(7/6)] exp(-r^2), with r = kappa / kappa_l
-    and kappa_l = 3.3 / l0 (Andrews 1992, https://doi.org/10.1080/09500349214551931; Hill 1978,
+    S_n(f) = 0.033 (2 pi)^(-2/3) (f^2 + 1/L0^2)^(-11/6) [1 + 1.802 r - 0.254 r^(7/6)] exp(-r^2), with
+    r = kappa / kappa_l and kappa_l = 3.3 / l0 (Andrews 1992, https://doi.org/10.1080/09500349214551931; Hill 1978,
     https://doi.org/10.1017/S002211207800227X).
     """
 
@@ -109,9 +109,9 @@ class Hill(TurbulenceSpectrumBase):
 class PowerLaw(TurbulenceSpectrumBase):
     """Power law of another exponent than Kolmogorov's.
 
-    Phi_n(kappa) = A(a) B kappa^(-a) with A(a) = Gamma(a - 1) cos(a pi / 2) / (4 pi^2), whose index structure function is
-    B r^(a - 3) for 3 < a < 5 (Toselli et al. 2008, https://doi.org/10.1117/1.2870113); slopes
-    have a finite variance for a < 4 only. Normalisation: Cn2 is defined by the structure function at the
+    Phi_n(kappa) = A(a) B kappa^(-a) with A(a) = Gamma(a - 1) cos(a pi / 2) / (4 pi^2), whose index structure function
+    is B r^(a - 3) for 3 < a < 5 (Toselli et al. 2008, https://doi.org/10.1117/1.2870113); slopes have a finite
+    variance for a < 4 only. Normalisation: Cn2 is defined by the structure function at the
     reference separation, B = Cn2 r_ref^(11/3 - a), so that D_n(r_ref) = Cn2 r_ref^(2/3) for every exponent. With
     a = 11/3, A = 0.0330 and the spectrum is Kolmogorov's (to 1e-3: 0.033 is rounded there).
     """
@@ -121,7 +121,7 @@ class PowerLaw(TurbulenceSpectrumBase):
     exponent: float = Field(gt=3, lt=4)
     """Exponent a of the three-dimensional spectrum; Kolmogorov's is 11/3."""
 
-    reference: Length = Field(default="1 m", gt=0, validate_default=True)  # type: ignore[assignment]
+    reference: Length = Field(default="1 m", gt=0, validate_default=True)
     """Separation r_ref at which the structure function is that of Kolmogorov's spectrum."""
 
     def psd(self, f: NDArray[np.float64]) -> NDArray[np.float64]:
