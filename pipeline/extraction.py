@@ -61,9 +61,12 @@ BAD_LIGHT = 0.3
 #: Along the line of sources, part of their distance that a window may cover.
 ALONG = 0.9
 #: Across, and for a single source, size of the window in units of the spot's full width at half maximum.
-ACROSS = 7.0
+ACROSS = 6.6
 #: Pixels around a bad one that predict it, on each side.
 NEIGHBOURS = 2
+
+#: Frames that are gone through box by box. Speed only: every frame is measured on its own.
+BLOCK = 16
 
 _NUMPY_TYPES = (np.uint8, np.uint16, np.int16, np.float32)
 
@@ -306,9 +309,7 @@ def extract(
         The frames have another shape than the mean frame, or a type that is not read.
     """
     if frames.ndim != 3 or frames.shape[1:] != layout.frame_shape:
-        raise ValueError(
-            f"frames of shape {frames.shape} do not fit the layout's frames of shape {layout.frame_shape}"
-        )
+        raise ValueError(f"frames of shape {frames.shape} do not fit the layout's frames of shape {layout.frame_shape}")
     if frames.dtype not in _NUMPY_TYPES:
         raise ValueError(f"frames of type {frames.dtype}: uint8, uint16, int16 or float32 are read")
     frames = np.ascontiguousarray(frames)
@@ -316,9 +317,10 @@ def extract(
     slopes = np.empty((len(frames), 2, n_sources, n_boxes))
     flux = np.empty((len(frames), n_sources, n_boxes))
     flag = np.empty((len(frames), n_sources, n_boxes), dtype=np.uint8)
-    whole = parameters.method == "moving_maximum"
-    span = int((layout.search[..., 3] - layout.search[..., 2]).max()) + 1
-    _kernel(layout.pitch[1], -(-span // 8) * 8)(
+    columns = layout.pitch[1]
+    tall, wide = (int(side) for side in layout.window)
+    saturation = np.inf if calibration.saturation is None else float(calibration.saturation)
+    _kernel(columns, _eights(int(2 * parameters.search) + 1), tall, _eights(wide + 2))(
         frames.reshape(-1),
         len(frames),
         layout.frame_shape[0] * layout.frame_shape[1],
@@ -334,11 +336,12 @@ def extract(
         layout.spots,
         layout.search,
         np.array(layout.window, dtype=np.float32),
-        np.uint8(whole),
-        1 if whole else parameters.passes,
+        1 if parameters.method == "moving_maximum" else parameters.passes,
         np.maximum(FLUX_FLOOR * layout.flux, 0.0),
+        _half_way(layout.spots),
         layout.excluded,
-        np.inf if calibration.saturation is None else float(calibration.saturation),
+        _lowest_saturated(layout, saturation),
+        saturation,
         layout.pixel_scale,
         slopes,
         flux,
@@ -380,7 +383,7 @@ def response_to_tilt(
                 [ndimage.shift(template, np.multiply(step, move), order=3, mode="nearest") for move in moves]
             )
             spots = np.repeat(layout.centre[:, None, :], len(boxes), axis=1)
-            found, _ = _measure_boxes(_bare(layout, spots), boxes, parameters)
+            found, _ = _measure_boxes(replace(layout, spots=spots), boxes, parameters)
             gain[axis, source] = np.polyfit(moves, found[source, :, 1 - axis] - centre[1 - axis], 1)[0]
     return gain
 
@@ -405,16 +408,8 @@ def _calibrated_boxes(
         if array is not None and np.shape(array) != mean_frame.shape:
             raise ValueError(f"{name} has shape {np.shape(array)}, but a frame has {mean_frame.shape}")
     raw = _cut(mean_frame, boxes, pitch)
-    flat = (
-        np.ones_like(raw)
-        if calibration.flat is None
-        else _cut(np.asarray(calibration.flat, float), boxes, pitch)
-    )
-    dark = (
-        np.zeros_like(raw)
-        if calibration.dark is None
-        else _cut(np.asarray(calibration.dark, float), boxes, pitch)
-    )
+    flat = np.ones_like(raw) if calibration.flat is None else _cut(np.asarray(calibration.flat, float), boxes, pitch)
+    dark = np.zeros_like(raw) if calibration.dark is None else _cut(np.asarray(calibration.dark, float), boxes, pitch)
     bad = ~(np.isfinite(raw) & np.isfinite(dark) & np.isfinite(flat) & (flat > 0))
     if calibration.bad_pixel is not None:
         bad |= _cut(np.asarray(calibration.bad_pixel, bool), boxes, pitch)
@@ -505,10 +500,11 @@ def _window(
     parameters: ExtractionParameters, nominal: Floats, pitch: tuple[int, int], fwhm: float
 ) -> tuple[float, float]:
     """Size (along y, along x) of the window, px."""
-    # Room for the spot to move: the window must stay inside the box wherever the spot is looked for.
+    # Room for the spot to move: the window must stay inside the box wherever the spot is looked for. Rounded to an
+    # odd number, so that the seeing of the moment does not change the window from one batch to the next.
     edge = np.minimum(nominal + 0.5, np.array(pitch) - 0.5 - nominal).min(axis=0)
     room = np.maximum(2.0 * (edge - parameters.search), edge)
-    size = np.minimum(ACROSS * fwhm, room)
+    size = np.minimum(2.0 * np.round((ACROSS * fwhm - 1.0) / 2.0) + 1.0, room)
     if len(nominal) == 1:
         size[:] = size.min()
     else:
@@ -523,9 +519,7 @@ def _window(
         # The largest odd number of whole pixels that is not larger.
         height, width = (max(2.0 * math.floor((side - 1.0) / 2.0) + 1.0, 1.0) for side in (height, width))
     if height >= pitch[0] or width >= pitch[1]:
-        raise ValueError(
-            f"a window of {height:g} x {width:g} px does not fit into a box of {pitch[0]} x {pitch[1]} px"
-        )
+        raise ValueError(f"a window of {height:g} x {width:g} px does not fit into a box of {pitch[0]} x {pitch[1]} px")
     return height, width
 
 
@@ -555,7 +549,7 @@ def _search_region(spots: Floats, pitch: tuple[int, int], search: float) -> NDAr
     return np.stack([low[..., 0], high[..., 0], low[..., 1], high[..., 1]], axis=-1).astype(np.int64)
 
 
-def _bare(layout: SpotLayout, spots: Floats) -> SpotLayout:
+def _bare(layout: SpotLayout, spots: Floats, search: float) -> SpotLayout:
     """A layout for boxes that are calibrated and whole already, one box per frame-wide strip."""
     n_sources, n_boxes = spots.shape[:2]
     rows, cols = layout.pitch
@@ -567,7 +561,7 @@ def _bare(layout: SpotLayout, spots: Floats) -> SpotLayout:
         pixel_scale=1.0,
         spots=spots,
         flux=np.zeros((n_sources, n_boxes)),
-        search=_search_region(spots, layout.pitch, max(2.0, 0.5 * layout.fwhm)),
+        search=_search_region(spots, layout.pitch, search),
         scale=np.ones((n_boxes, rows, cols), dtype=np.float32),
         offset=np.zeros((n_boxes, rows, cols), dtype=np.float32),
         bad_start=start,
@@ -578,11 +572,9 @@ def _bare(layout: SpotLayout, spots: Floats) -> SpotLayout:
     )
 
 
-def _measure_boxes(
-    layout: SpotLayout, boxes: Floats, parameters: ExtractionParameters
-) -> tuple[Floats, Floats]:
+def _measure_boxes(layout: SpotLayout, boxes: Floats, parameters: ExtractionParameters) -> tuple[Floats, Floats]:
     """Positions (S, A, 2) and fluxes (S, A) on calibrated boxes (A, rows, cols)."""
-    bare = _bare(layout, layout.spots)
+    bare = _bare(layout, layout.spots, min(parameters.search, max(2.0, 0.5 * layout.fwhm)))
     frame = boxes.astype(np.float32).reshape(1, *bare.frame_shape)
     moved, flux, _ = extract(frame, bare, Calibration(), parameters)
     return layout.spots + moved[0, ::-1].transpose(1, 2, 0), flux[0]
@@ -612,17 +604,14 @@ def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDA
     rows, cols = np.indices(filled.shape[1:])
     for box, image in enumerate(filled):
         inside = [
-            (np.abs(rows - row) < window[0] / 2) & (np.abs(cols - col) < window[1] / 2)
-            for row, col in spots[:, box]
+            (np.abs(rows - row) < window[0] / 2) & (np.abs(cols - col) < window[1] / 2) for row, col in spots[:, box]
         ]
         outside = image[~np.any(inside, axis=0)]
         level = float(np.median(outside))
         scatter = 1.4826 * float(np.median(np.abs(outside - level)))
         for source, (row, col) in enumerate(spots[:, box]):
             core = (np.abs(rows - row) <= 1.0) & (np.abs(cols - col) <= 1.0)
-            found[source, box] = (
-                float(image[core].mean()) - level > 5.0 * scatter and float(image[core].mean()) > level
-            )
+            found[source, box] = float(image[core].mean()) - level > 5.0 * scatter and float(image[core].mean()) > level
     return found
 
 
@@ -677,9 +666,7 @@ def _predictors(
         right = np.zeros(len(usable))
         for source, spline in enumerate(splines):
             at = pixels[None] - shift[:, None] + (centre[source] - spots[source, box])
-            values = ndimage.map_coordinates(
-                spline, at.reshape(-1, 2).T, order=3, mode="nearest", prefilter=False
-            )
+            values = ndimage.map_coordinates(spline, at.reshape(-1, 2).T, order=3, mode="nearest", prefilter=False)
             values = values.reshape(at.shape[:2]) / template[source].max()
             normal += (values[:, 1:].T * likely) @ values[:, 1:]
             right += (values[:, 1:].T * likely) @ values[:, 0]
@@ -699,31 +686,66 @@ def _light_on(
         if hole.any():
             row, col = spots[source, box]
             near = (np.abs(rows - row) < window[0] / 2) & (np.abs(cols - col) < window[1] / 2)
-            image = ndimage.shift(
-                template[source], spots[source, box] - centre[source], order=1, mode="nearest"
-            )
+            image = ndimage.shift(template[source], spots[source, box] - centre[source], order=1, mode="nearest")
             total = float(image[near].sum())
             light[source, box] = float(image[near & hole].sum()) / total if total > 0 else 1.0
     return light
+
+
+def _eights(number: int) -> int:
+    """The next multiple of eight."""
+    return -(-number // 8) * 8
+
+
+def _half_way(spots: Floats) -> Floats:
+    """Vectors, (S, A, 2), whose product with a displacement reaches 1 half way to the other source."""
+    if len(spots) == 1:
+        return np.zeros_like(spots)
+    apart = spots[::-1] - spots
+    vectors: Floats = 2.0 * apart / np.maximum((apart**2).sum(axis=-1, keepdims=True), 1e-12)
+    return vectors
+
+
+def _lowest_saturated(layout: SpotLayout, saturation: float) -> NDArray[np.float32]:
+    """Lowest calibrated value that a saturated pixel of each box can have, (A,)."""
+    if math.isinf(saturation):
+        return np.full(len(layout.boxes), np.inf, dtype=np.float32)
+    level = np.where(layout.scale > 0, saturation * layout.scale - layout.offset, np.inf)
+    lowest: NDArray[np.float32] = level.min(axis=(1, 2)).astype(np.float32)
+    # Rounding of the calibrated value must not hide a saturated pixel.
+    lowest -= np.abs(lowest) * np.float32(1e-5)
+    return lowest
 
 
 # --- the kernel ---------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=64)
-def _kernel(columns: int, lanes: int) -> Callable[..., None]:
-    """Compiled measurement for boxes of a given width.
+def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., None]:
+    """Compiled measurement for one shape of box, search and window.
 
-    The width, and the width of the search, are constants of the compiled code: only then are the inner loops
-    turned into vector instructions. Index arithmetic is unsigned because a signed index is first tested for
-    counting from the end. Running sums down the columns of a box, of v and of row * v, make a window of any
-    height with fractional borders a difference of two interpolated rows.
+    Parameters
+    ----------
+    columns : int
+        Width of a box.
+    lanes : int
+        Width of the search, rounded up to a multiple of 8.
+    tall : int
+        Whole part of the window's height: it touches tall + 2 rows, and covers all but the first and the last two.
+    wide : int
+        Columns that a window can touch, rounded up to a multiple of 8.
+
+    Notes
+    -----
+    These widths are constants of the compiled code: only then are the inner loops unrolled and turned into vector
+    instructions. Index arithmetic is unsigned because a signed index is first tested for counting from the end.
     """
     # No nnan and no ninf: a pixel that is not a number must reach the tests below.
     relaxed = {"reassoc", "contract", "nsz", "arcp"}
     single, long, index = np.float32, np.int64, np.uint64
-    pitch = columns
-    level = 2 * pitch
+    half, one, none = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+    no_light, window_left, strayed = FLAGS["no_light"], FLAGS["window_left"], FLAGS["strayed"]
+    not_converged, saturated = FLAGS["not_converged"], FLAGS["saturated"]
 
     @njit(nogil=True, cache=True, fastmath=relaxed, error_model="numpy")
     def measure(
@@ -742,143 +764,163 @@ def _kernel(columns: int, lanes: int) -> Callable[..., None]:
         spots: Any,
         search: Any,
         window: Any,
-        whole: Any,
         passes: Any,
         floor: Any,
+        divide: Any,
         excluded: Any,
+        suspect: Any,
         saturation: Any,
         pixel_scale: Any,
         slopes: Any,
         flux: Any,
         flag: Any,
     ) -> None:
-        n_boxes = first_pixel.size
         n_sources = spots.shape[0]
-        half_y = single(0.5) * window[0]
-        half_x = single(0.5) * window[1]
-        half = single(0.5)
-        box = np.zeros(rows * pitch + lanes, dtype=np.float32)
-        sums = np.zeros((rows + 1) * level, dtype=np.float32)
+        half_y = half * window[0]
+        half_x = half * window[1]
+        # Rows and columns beyond the box are read with weight 0.
+        box = np.zeros((rows + 2) * columns + wide + lanes, dtype=np.float32)
         peak = np.zeros(lanes, dtype=np.float32)
-        for frame in range(n_frames):
-            for a in range(n_boxes):
-                # Calibrate the box once for both sources.
-                origin = index(frame) * index(frame_size) + index(first_pixel[a])
-                i = origin
-                j = index(a) * index(rows * columns)
-                o = index(0)
-                for _ in range(rows):
-                    for k in range(index(columns)):
-                        box[o + k] = single(frames[i + k]) * scale[j + k] - offset[j + k]
-                    i += index(frame_columns)
-                    j += index(columns)
-                    o += index(pitch)
-                for b in range(bad_start[a], bad_start[a + 1]):
-                    box[bad_index[b]] = single(0)
-                for b in range(bad_start[a], bad_start[a + 1]):
-                    value = single(0)
-                    for m in range(bad_neighbour.shape[1]):
-                        value += bad_weight[b, m] * box[bad_neighbour[b, m]]
-                    box[bad_index[b]] = value
-                o = index(0)
-                u = index(0)
-                for r in range(rows):
-                    height = single(r)
-                    for k in range(index(columns)):
-                        value = box[o + k]
-                        sums[u + index(level) + k] = sums[u + k] + value
-                        sums[u + index(level + pitch) + k] = sums[u + index(pitch) + k] + height * value
-                    o += index(pitch)
-                    u += index(level)
-                for s in range(n_sources):
-                    state = excluded[s, a]
-                    # Brightest pixel: largest of each column, then the column, then its row.
-                    top = search[s, a, 0]
-                    bottom = search[s, a, 1]
-                    left = search[s, a, 2]
-                    right = search[s, a, 3]
-                    o = index(top * pitch + left)
-                    for k in range(index(lanes)):
-                        peak[k] = box[o + k]
-                    for _ in range(top, bottom):
-                        o += index(pitch)
-                        for k in range(index(lanes)):
-                            value = box[o + k]
-                            known = peak[k]
-                            peak[k] = value if value > known else known
-                    best = peak[0]
-                    column = long(0)
-                    for k in range(1, right - left + 1):
-                        larger = peak[k] > best
-                        best = peak[k] if larger else best
-                        column = long(k) if larger else column
-                    row = long(top)
-                    o = index(top * pitch + left + column)
-                    for r in range(top, bottom + 1):
-                        row = long(r) if box[o] == best else row
-                        o += index(pitch)
-                    y = single(row)
-                    x = single(left + column)
-                    light = single(0)
-                    last_y = y
-                    last_x = x
-                    for _ in range(passes):
-                        # Borders of the window, counted from the outer border of the box's first pixel.
-                        up = y - half_y + half
-                        down = y + half_y + half
-                        start = x - half_x + half
-                        stop = x + half_x + half
-                        if not (up >= 0 and down <= rows and start >= 0 and stop <= columns):
-                            state |= 2
-                            break
-                        r_up = min(long(up), rows - 1)
-                        r_down = min(long(down), rows - 1)
-                        f_up = up - single(r_up)
-                        f_down = down - single(r_down)
-                        u = index(r_up * level)
-                        d = index(r_down * level)
-                        light = single(0)
-                        moment_x = single(0)
-                        moment_y = single(0)
+        at_y = np.zeros(n_sources, dtype=np.float32)
+        at_x = np.zeros(n_sources, dtype=np.float32)
+        last_y = np.zeros(n_sources, dtype=np.float32)
+        last_x = np.zeros(n_sources, dtype=np.float32)
+        light_of = np.zeros(n_sources, dtype=np.float32)
+        brightest = np.zeros(n_sources, dtype=np.float32)
+        states = np.zeros(n_sources, dtype=np.uint8)
+        # Box by box through a block of frames: scale and offset of the box then stay in the nearest cache.
+        for begin in range(0, n_frames, BLOCK):
+            for a in range(first_pixel.size):
+                for frame in range(begin, min(begin + BLOCK, n_frames)):
+                    # Calibrate the box once for both sources.
+                    start_of_box = index(frame) * index(frame_size) + index(first_pixel[a])
+                    i = start_of_box
+                    j = index(a) * index(rows * columns)
+                    o = index(0)
+                    for _ in range(rows):
                         for k in range(index(columns)):
-                            at = single(np.int32(k))
-                            w = max(min(at + single(1), stop) - max(at, start), single(0))
-                            u0 = sums[u + k]
-                            u1 = sums[u + index(pitch) + k]
-                            d0 = sums[d + k]
-                            d1 = sums[d + index(pitch) + k]
-                            v = (d0 - u0) + f_down * (sums[d + index(level) + k] - d0)
-                            v -= f_up * (sums[u + index(level) + k] - u0)
-                            m = (d1 - u1) + f_down * (sums[d + index(level + pitch) + k] - d1)
-                            m -= f_up * (sums[u + index(level + pitch) + k] - u1)
-                            v *= w
-                            light += v
-                            moment_x += v * at
-                            moment_y += w * m
-                        last_y = y
-                        last_x = x
-                        y = moment_y / light
-                        x = moment_x / light
-                    if not (light > floor[s, a]):
-                        state |= 1
-                    elif state == 0:
-                        own = (y - spots[s, a, 0]) ** 2 + (x - spots[s, a, 1]) ** 2
-                        for other in range(n_sources):
-                            if other != s:
-                                away = (y - spots[other, a, 0]) ** 2 + (x - spots[other, a, 1]) ** 2
-                                if away < own:
-                                    state |= 4
-                        if passes > 1 and max(abs(y - last_y), abs(x - last_x)) > CONVERGENCE:
-                            state |= 8
-                    if state == 0:
-                        slopes[frame, 0, s, a] = (x - spots[s, a, 1]) * pixel_scale
-                        slopes[frame, 1, s, a] = (y - spots[s, a, 0]) * pixel_scale
-                        flux[frame, s, a] = light
-                    else:
-                        slopes[frame, 0, s, a] = np.nan
-                        slopes[frame, 1, s, a] = np.nan
-                        flux[frame, s, a] = np.nan
-                    flag[frame, s, a] = state
+                            box[o + k] = single(frames[i + k]) * scale[j + k] - offset[j + k]
+                        i += index(frame_columns)
+                        j += index(columns)
+                        o += index(columns)
+                    for b in range(bad_start[a], bad_start[a + 1]):
+                        box[bad_index[b]] = none
+                    for b in range(bad_start[a], bad_start[a + 1]):
+                        value = none
+                        for m in range(bad_neighbour.shape[1]):
+                            value += bad_weight[b, m] * box[bad_neighbour[b, m]]
+                        box[bad_index[b]] = value
+                    for s in range(n_sources):
+                        # Brightest pixel: largest of each column, then the column, then its row.
+                        top = search[s, a, 0]
+                        bottom = search[s, a, 1]
+                        left = search[s, a, 2]
+                        right = search[s, a, 3]
+                        o = index(top * columns + left)
+                        for k in range(index(lanes)):
+                            peak[k] = box[o + k]
+                        for _ in range(top, bottom):
+                            o += index(columns)
+                            for k in range(index(lanes)):
+                                value = box[o + k]
+                                known = peak[k]
+                                peak[k] = value if value > known else known
+                        best = peak[0]
+                        column = long(0)
+                        for k in range(1, right - left + 1):
+                            larger = peak[k] > best
+                            best = peak[k] if larger else best
+                            column = long(k) if larger else column
+                        row = long(top)
+                        o = index(top * columns + left + column)
+                        for r in range(top, bottom + 1):
+                            row = long(r) if box[o] == best else row
+                            o += index(columns)
+                        at_y[s] = single(row)
+                        at_x[s] = single(left + column)
+                        light_of[s] = none
+                        brightest[s] = best
+                        states[s] = excluded[s, a]
+                    # Both sources in each pass, so that the processor can overlap the two.
+                    for _ in range(passes):
+                        for s in range(n_sources):
+                            y = at_y[s]
+                            x = at_x[s]
+                            # Borders of the window, counted from the outer border of the box's first pixel.
+                            up = y - half_y + half
+                            down = y + half_y + half
+                            start = x - half_x + half
+                            stop = x + half_x + half
+                            if not (up >= none and down <= rows and start >= none and stop <= columns):
+                                states[s] |= window_left
+                                continue
+                            row = long(up)
+                            column = long(start)
+                            down -= single(row)
+                            start -= single(column)
+                            stop -= single(column)
+                            first = one - (up - single(row))
+                            last = min(down - single(tall), one)
+                            after = max(down - single(tall + 1), none)
+                            o = index(row * columns + column)
+                            end = o + index(tall * columns)
+                            light = none
+                            moment_x = none
+                            moment_y = none
+                            for k in range(index(wide)):
+                                total = first * box[o + k]
+                                moment = none
+                                for r in range(index(1), index(tall)):
+                                    value = box[o + r * index(columns) + k]
+                                    total += value
+                                    moment += single(np.int32(r)) * value
+                                value = last * box[end + k]
+                                total += value
+                                moment += single(tall) * value
+                                value = after * box[end + index(columns) + k]
+                                total += value
+                                moment += single(tall + 1) * value
+                                at = single(np.int32(k))
+                                part = max(min(at + one, stop) - max(at, start), none)
+                                total *= part
+                                light += total
+                                moment_x += at * total
+                                moment_y += part * moment
+                            last_y[s] = y
+                            last_x[s] = x
+                            light_of[s] = light
+                            at_y[s] = moment_y / light + single(row)
+                            at_x[s] = moment_x / light + single(column)
+                    for s in range(n_sources):
+                        state = states[s]
+                        light = light_of[s]
+                        y = at_y[s]
+                        x = at_x[s]
+                        move_y = y - spots[s, a, 0]
+                        move_x = x - spots[s, a, 1]
+                        if state & window_left == 0:
+                            if not light > floor[s, a]:
+                                state |= no_light
+                            elif not move_y * divide[s, a, 0] + move_x * divide[s, a, 1] < one:
+                                state |= strayed
+                            elif passes > 1 and max(abs(y - last_y[s]), abs(x - last_x[s])) > CONVERGENCE:
+                                state |= not_converged
+                        good = state == 0
+                        slopes[frame, 0, s, a] = move_x * pixel_scale if good else np.nan
+                        slopes[frame, 1, s, a] = move_y * pixel_scale if good else np.nan
+                        flux[frame, s, a] = light if good else np.nan
+                        if brightest[s] >= suspect[a]:
+                            # Only now is it worth looking at every pixel of the window.
+                            low_y = max(long(last_y[s] - half_y + half), long(0))
+                            low_x = max(long(last_x[s] - half_x + half), long(0))
+                            for r in range(low_y, min(low_y + long(tall + 2), long(rows))):
+                                for k in range(low_x, min(low_x + long(wide), long(columns))):
+                                    inside = abs(single(r) - last_y[s]) < half_y and abs(single(k) - last_x[s]) < half_x
+                                    used = scale[index((a * rows + r) * columns + k)] != none
+                                    raw = frames[start_of_box + index(r * frame_columns + k)]
+                                    if inside and used and raw >= saturation:
+                                        state |= saturated
+                        flag[frame, s, a] = state
 
     compiled: Callable[..., None] = measure
     return compiled
