@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from ..pipeline.parameters import FORMAT, FORMAT_VERSION, Header
+from ..pipeline.parameters import FORMAT, FORMAT_VERSION, Header, overlay, spot_faults, text_faults
 from ..pipeline.units import QuantityError, faults, parse, safe
 from .archive_codecs import ArraySpec, DamagedChunk, Missing, StoredArray, find_chunks, parse_array
 from .archive_stores import Store, StoreError, open_store, shown
@@ -289,7 +289,9 @@ class Archive:
         return digest.hexdigest()
 
 
-def open_archive(url: str | os.PathLike[str], *, allow_missing: bool = False) -> Archive:
+def open_archive(
+    url: str | os.PathLike[str], *, allow_missing: bool = False, complete: Mapping[str, Any] | None = None
+) -> Archive:
     """Open and validate a raw frame archive.
 
     Parameters
@@ -299,6 +301,8 @@ def open_archive(url: str | os.PathLike[str], *, allow_missing: bool = False) ->
     allow_missing : bool
         Open an archive of which some chunks of frames are missing; they are listed in `missing_chunks` and
         reading one raises :class:`ChunkError`. Otherwise a missing chunk is a fault as any other.
+    complete : mapping, optional
+        Tables that complete or replace those of the header, as a campaign file may hold them.
 
     Returns
     -------
@@ -317,6 +321,8 @@ def open_archive(url: str | os.PathLike[str], *, allow_missing: bool = False) ->
         attributes = _group(store, fault)
         fault.raise_any()
         assert attributes is not None
+        if complete:
+            attributes = overlay(attributes, complete)
         return _Opening(url, store, attributes, fault, allow_missing).archive()
     except StoreError as error:
         fault.say(str(error))
@@ -523,7 +529,11 @@ def check_header(attributes: dict[str, Any], fault: Faults) -> Header | None:
     try:
         return Header.model_validate(attributes)
     except ValidationError as error:
-        fault.sentences += faults(error, fault.origin)
+        # The model looks at texts and spots only once all fields are right; a fault of theirs must not wait for that.
+        if any(found["loc"] for found in error.errors(include_url=False)):
+            fault.sentences += faults(error, fault.origin)
+        for sentence in [*text_faults(attributes), *spot_faults(attributes)]:
+            fault.say(sentence)
     return None
 
 

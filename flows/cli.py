@@ -78,9 +78,9 @@ def _stop(signum: int, frame: Any) -> NoReturn:
 
 def main() -> None:
     """Run the command line; no traceback reaches the user unless COSLIDAR_DEBUG is set."""
-    from .cluster import limit_threads
-
-    limit_threads()
+    # One thread for each numerical library, before any is imported: the batches are what runs in parallel.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
     signal.signal(signal.SIGTERM, _stop)
     try:
         sys.exit(cli.main(standalone_mode=False) or 0)

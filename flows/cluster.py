@@ -76,12 +76,15 @@ class BatchOutcome:
         Correlations, where they were computed just now.
     frames_read : int
         Frames that were read for it.
+    transient : bool
+        Whether it failed for a reason in the machine, so that another try may succeed.
     """
 
     window: BatchWindow
     result: BatchResult
     reduced: ReducedBatch | None
     frames_read: int
+    transient: bool = False
 
 
 _open: OrderedDict[str, Archive] = OrderedDict()
@@ -226,12 +229,6 @@ def _same_versions(client: Client) -> None:
     )
     if wrong:
         raise ConnectionError(f"versions differ: {'; '.join(wrong)}; install the same environment everywhere")
-
-
-def limit_threads() -> None:
-    """One thread for each numerical library, before any of them is imported: the batches are what runs in parallel."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def as_stored(reduced: ReducedBatch) -> dict[str, np.ndarray[Any, Any]]:

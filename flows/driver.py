@@ -13,11 +13,14 @@ from dataclasses import dataclass, field
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+
 from ..catalog.archive import ArchiveError
+from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
 from ..pipeline import response
-from ..pipeline.units import safe
+from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from .cluster import BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
 from .plan import ArchivePlan, BatchWindow, plan_archive
@@ -25,8 +28,8 @@ from .settings import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
+    from pathlib import Path
 
-    import numpy as np
     from distributed import Client
     from numpy.typing import NDArray
 
@@ -110,16 +113,21 @@ class Work:
     run: Any
     client: Client
     progress: Progress
+    correlations: Kept = field(init=False)
+    responses: Kept = field(init=False)
     _matrices: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
+
+    def __post_init__(self) -> None:
+        self.correlations, self.responses = kept_of(self.catalog.root)
 
     def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
         """Response matrix, computed once for all archives of one geometry."""
         with self._lock:
             digest = str(plan.response_key)
             found = self._matrices.get(digest)
-            if found is None:
-                found = self.catalog.scratch.load_arrays("response", digest, "matrix").get("M")
+            if found is None and (kept := self.responses.load(digest)) is not None:
+                found = kept["M"]
             if found is None:
                 parameters = self.settings.configuration.response
                 found = response.response_matrix(
@@ -130,9 +138,14 @@ class Work:
                     sampling=parameters.sampling,
                     slope_response=parameters.slope_response,
                 )
-                self.catalog.scratch.save_arrays("response", digest, "matrix", {"M": found})
+                self.responses.save(digest, {"M": found})
             self._matrices[digest] = found
             return found
+
+
+def kept_of(root: Path) -> tuple[Kept, Kept]:
+    """Where a catalog keeps correlations and response matrices."""
+    return Kept(root / "correlations"), Kept(root / "responses")
 
 
 def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
@@ -141,6 +154,7 @@ def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
         geometry=plan.geometry,
         grid=plan.grid,
         matrix=work.matrix(plan),
+        sampling=work.settings.configuration.response.sampling,
         regulariser=plan.regulariser,
         selector=plan.selector,
         inversion=work.settings.configuration.inversion,
@@ -163,59 +177,100 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
         outcome = ArchiveOutcome(url, name, "failed", faults=(reason,))
     if outcome.status in ("refused", "failed"):
         for fault in outcome.faults:
-            work.catalog.record_failure(work.run, archive=url, batch=None, reason=fault)
+            work.catalog.record_failure(work.run, url, fault)
     work.progress.finished(outcome)
     return outcome
 
 
 def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     catalog, digest = work.catalog, str(plan.profile_key)
-    if (present := catalog.has(plan.archive.identity, digest)) is not None:
-        return ArchiveOutcome(plan.url, plan.name, "present", batches=len(plan.windows), product=str(present))
+    if catalog.has(plan.archive.identity, digest):
+        row = catalog.products(archive_identity=plan.archive.identity, lineage_key=digest)[0]
+        return ArchiveOutcome(plan.url, plan.name, "present", batches=row.batches, product=str(row.path))
     remember(plan.archive)
     done: dict[int, BatchResult] = {}
     for window in plan.windows:
-        if (kept := catalog.scratch.load(digest, str(window.start_time))) is not None:
-            done[window.index] = kept
+        if (finished := catalog.scratch.load(plan.result_key(window))) is not None:
+            done[window.index] = finished
     reused = len(done)
     todo = [window for window in plan.windows if window.index not in done]
     work.progress.planned(plan.name, len(todo))
-    frames_read = 0
+    frames_read, transient = 0, False
     for window, outcome in _compute(plan, todo, work):
         frames_read += outcome.frames_read
         if outcome.reduced is not None:
-            catalog.scratch.save_arrays(
-                "correlation", str(plan.reduction_key), str(window.start_time), as_stored(outcome.reduced)
-            )
-        catalog.scratch.save(digest, str(window.start_time), outcome.result)
+            work.correlations.save(plan.correlation_key(window), as_stored(outcome.reduced))
+        if outcome.transient:
+            transient = True
+        else:
+            catalog.scratch.save(plan.result_key(window), outcome.result)
         done[window.index] = outcome.result
+        if outcome.result.reason:
+            catalog.record_failure(
+                work.run, plan.url, outcome.result.reason, start=window.start_time, stop=window.stop_time
+            )
         work.progress.advanced(plan.name, window.index, outcome.result.reason)
 
     results = [done[window.index] for window in plan.windows]
     faults = tuple(
         f"{plan.name}: batch {number}: {result.reason}" for number, result in enumerate(results) if result.reason
     )
-    if len(faults) == len(results):
-        return ArchiveOutcome(
-            plan.url, plan.name, "failed", len(results), len(faults), reused, frames_read, faults, input_fault=True
-        )
-    dataset = assemble(results, plan, work.settings)
-    product = catalog.publish(dataset, run=work.run, archive=plan.archive, lineage=plan.lineage(), url=plan.url)
-    for fault in faults:
-        catalog.record_failure(work.run, archive=plan.url, batch=None, reason=fault)
-    catalog.scratch.remove(digest)
+    counts = {"batches": len(results), "failed_batches": len(faults), "reused": reused, "frames_read": frames_read}
+    if len(faults) == len(results) or transient:
+        # What the machine spoiled may succeed next time; what the data forbid never will.
+        return ArchiveOutcome(plan.url, plan.name, "failed", faults=faults, input_fault=not transient, **counts)
+    header = plan.header
+    dataset = assemble(
+        results,
+        {
+            "z": plan.grid.centres,
+            "z_bounds": np.stack([plan.grid.edges[:-1], plan.grid.edges[1:]], axis=1),
+            "dy": plan.geometry.lags[:, 0, 1] * plan.geometry.subaperture_size,
+            "dx": plan.geometry.lags[0, :, 0] * plan.geometry.subaperture_size,
+            "pair_count": plan.geometry.pair_count,
+        },
+        campaign=header.campaign,
+        archive=header.archive,
+        archive_identity=plan.archive.identity,
+        lineage=plan.profile_key,
+        wavelength=header.instrument.wavelength,
+        sources=[source.name for source in header.sources],
+        attributes=attributes_of(plan, work.settings),
+    )
+    published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes)
+    catalog.scratch.remove(plan.result_key(window) for window in plan.windows)
     return ArchiveOutcome(
         plan.url,
         plan.name,
         "published",
-        len(results),
-        len(faults),
-        reused,
-        frames_read,
-        faults,
-        product=str(product),
+        faults=faults,
+        product=str(published.row.path),
         input_fault=bool(faults),
+        **counts,
     )
+
+
+def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
+    """What a reader of the product wants to know at first sight; the lineage has everything."""
+    header, parameters = plan.header, settings.configuration
+    attributes: dict[str, Any] = {
+        "instrument": header.instrument.name or "unnamed instrument",
+        "path_length": text(header.path.length, "m"),
+        "subaperture_size": text(header.instrument.subaperture_size, "m"),
+        "batch_duration": text(parameters.batch.duration, "s"),
+        "sampling": parameters.response.sampling,
+        "slope_response": parameters.response.slope_response,
+        "covariance": parameters.correlation.covariance,
+        "source_model": settings.plugins["source"]["name"],
+        "spectrum": settings.plugins["spectrum"]["name"],
+        "regulariser": settings.plugins["regulariser"]["name"],
+        "selector": settings.plugins["selector"]["name"],
+    }
+    if header.site is not None:
+        for key in ("name", "timezone"):
+            if value := getattr(header.site, key):
+                attributes[f"site_{key}"] = value
+    return attributes
 
 
 def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator[tuple[BatchWindow, BatchOutcome]]:
@@ -233,7 +288,7 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
         window = next(waiting, None)
         if window is None:
             return None
-        stored = work.catalog.scratch.load_arrays("correlation", str(plan.reduction_key), str(window.start_time))
+        stored = work.correlations.load(plan.correlation_key(window))
         task = BatchTask(
             url=plan.url,
             identity=plan.archive.identity,
@@ -261,7 +316,8 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
             except Exception as error:
                 reason = f"{type(error).__name__}: {safe(str(error))}"
                 log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
-                outcome = BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0)
+                result = stages.failed(window.start_time, window.stop_time, reason)
+                outcome = BatchOutcome(window, result, None, 0, transient=True)
             future.release()
             if (following := submit()) is not None:
                 flying.add(following)
@@ -288,13 +344,14 @@ def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[Arc
     list of ArchiveOutcome
         In the order of `archives`.
     """
-    state = "interrupted"
     try:
         outcomes = fan_out(process_archive, list(archives), work)
-        state = "done" if all(outcome.status in ("published", "present") for outcome in outcomes) else "incomplete"
-        return outcomes
-    finally:
-        work.catalog.finish_run(work.run, state)
+    except BaseException:
+        work.catalog.finish_run(work.run, "cancelled")
+        raise
+    complete = all(outcome.status in ("published", "present") for outcome in outcomes)
+    work.catalog.finish_run(work.run, "finished" if complete else "failed")
+    return outcomes
 
 
 def in_threads(process: Callable[[str, Work], ArchiveOutcome], archives: list[str], work: Work) -> list[ArchiveOutcome]:

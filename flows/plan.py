@@ -9,8 +9,7 @@ import numpy as np
 
 from ..catalog.archive import open_archive
 from ..pipeline import batch as stages
-from ..pipeline import response
-from ..pipeline.lineage import Key, checkout, document, key
+from ..pipeline.lineage import Key, checkout, make_key
 from ..pipeline.units import safe
 from .settings import InputError
 
@@ -91,9 +90,13 @@ class ArchivePlan:
         """Campaign and archive, for people."""
         return f"{self.header.campaign}/{self.header.archive}"
 
-    def lineage(self) -> dict[str, Any]:
-        """The keys of the product with everything that they were made of."""
-        return document(self.profile_key)
+    def correlation_key(self, window: BatchWindow) -> Key:
+        """Identity of the correlations of one batch."""
+        return make_key("correlation batch", 1, tracked=window.start_time, upstream=[self.reduction_key])
+
+    def result_key(self, window: BatchWindow) -> Key:
+        """Identity of what one batch contributes to the product."""
+        return make_key("profile batch", 1, tracked=window.start_time, upstream=[self.profile_key])
 
 
 def batch_windows(time: np.ndarray[Any, np.dtype[np.int64]], rate: float, batch: BatchParameters) -> list[BatchWindow]:
@@ -155,7 +158,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         Archive and settings do not fit each other.
     """
     # A missing chunk spoils its batch only; `inspect` calls it a fault.
-    archive = open_archive(url, overlay=settings.header, allow_missing=True)
+    archive = open_archive(url, complete=settings.header, allow_missing=True)
     header = archive.header
     origin = safe(url)
     if settings.campaign is not None and header.campaign != settings.campaign:
@@ -176,7 +179,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
 
     mark = checkout().mark
     instrument = header.instrument
-    measured = key(
+    measured = make_key(
         "measurements",
         stages.MEASURE_VERSION,
         tracked={
@@ -195,16 +198,16 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         upstream=[archive.identity],
         mark=mark,
     )
-    reduction = key(
+    reduction = make_key(
         "correlation",
         stages.REDUCE_VERSION,
         tracked=configuration.correlation.model_dump(),
         upstream=[measured],
         mark=mark,
     )
-    responses = key(
+    responses = make_key(
         "response",
-        response.VERSION,
+        stages.RESPONSE_VERSION,
         tracked={
             "sampling": configuration.response.sampling,
             "slope_response": configuration.response.slope_response,
@@ -218,7 +221,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         plugins={"sources": [source.identity() for source in sources], "spectrum": spectrum.identity()},
         mark=mark,
     )
-    profile = key(
+    profile = make_key(
         "profile",
         stages.RETRIEVE_VERSION,
         tracked=configuration.inversion.model_dump(),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import platform
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .cluster import connect
 from .driver import ArchiveOutcome, Progress, Work, execute, in_threads
@@ -28,6 +27,19 @@ class Silent:
         """Nothing."""
 
 
+def described(settings: Settings) -> dict[str, Any]:
+    """Settings as plain JSON, for the record of a run."""
+    return {
+        "campaign": settings.campaign,
+        "origin": settings.origin,
+        "archives": len(settings.archives),
+        "configuration": settings.configuration.model_dump(mode="json"),
+        "plugins": settings.plugins,
+        "header": settings.header,
+        "run": settings.run.model_dump(mode="json"),
+    }
+
+
 @contextmanager
 def session(settings: Settings, progress: Progress | None = None) -> Iterator[Work]:
     """Open what the archives of one run share, and close it in any case.
@@ -45,8 +57,8 @@ def session(settings: Settings, progress: Progress | None = None) -> Iterator[Wo
     """
     from ..catalog.store import Catalog
 
-    with connect(settings.run) as client, Catalog.open(settings.output) as catalog:
-        run = catalog.start_run(campaign=settings.campaign, host=platform.node())
+    with connect(settings.run) as client, Catalog(settings.output) as catalog:
+        run = catalog.start_run(described(settings))
         yield Work(settings, catalog, run, client, progress or Silent())
 
 

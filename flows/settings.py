@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import Field, ValidationError
 
-from ..pipeline.parameters import Configuration, Header, Name, Parameters
+from ..pipeline.parameters import Configuration, Header, Name, Parameters, overlay
 from ..pipeline.units import faults as sentences
 from ..pipeline.units import safe, text
 from ..plugins.registry import KEYS, PluginError, create, get
@@ -153,25 +153,6 @@ class Settings:
     def _plugin(self, key: str) -> Plugin:
         parameters = dict(self.plugins[key])
         return create(KEYS[key], str(parameters.pop("name")), parameters)
-
-
-def overlay(base: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge nested tables; lists of tables are merged item by item, everything else is replaced."""
-    merged = dict(base)
-    for key, value in above.items():
-        below = merged.get(key)
-        if isinstance(value, dict) and isinstance(below, dict):
-            merged[key] = overlay(below, value)
-        elif (
-            isinstance(value, list)
-            and isinstance(below, list)
-            and len(value) == len(below)
-            and all(isinstance(item, dict) for item in [*value, *below])
-        ):
-            merged[key] = [overlay(*pair) for pair in zip(below, value, strict=True)]
-        else:
-            merged[key] = value
-    return merged
 
 
 def plugin_text(value: str) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 1
+RESPONSE_VERSION = 1
 RETRIEVE_VERSION = 1
 
 #: Fewer frames than this make no correlation worth the name.
@@ -78,6 +79,8 @@ class Model:
         Slices of the profile.
     matrix : ndarray, (n, k)
         Response matrix M, slice thickness included.
+    sampling : {"mean", "midpoint"}
+        How M was sampled; integrals of the profile follow it.
     regulariser, selector
         Plugins.
     inversion : InversionParameters
@@ -87,6 +90,7 @@ class Model:
     geometry: Geometry
     grid: SliceGrid
     matrix: NDArray[np.float64]
+    sampling: Literal["mean", "midpoint"]
     regulariser: Regulariser
     selector: HyperparameterSelector
     inversion: InversionParameters
@@ -284,7 +288,9 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
     def joint(*names: str) -> NDArray[np.float64]:
         return np.array([unknown.get(name, (np.nan, np.nan))[0] for name in names])
 
-    point = turbulence.point_scintillation_index(profile.cn2, grid, geometry)
+    light = (grid, geometry.wavelength, geometry.path_length)
+    point = float(turbulence.point_source_index(profile.cn2, *light, sampling=model.sampling))
+    fried = turbulence.fried_parameter(profile.cn2, *light, sampling=model.sampling)
     values: dict[str, Any] = {
         "cn2": profile.cn2,
         "cn2_standard_error": profile.error_map,
@@ -301,7 +307,7 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
         "intensity_correlation": arrays["maps"][intensity],
         "intensity_correlation_model": fitted[intensity],
         "intensity_correlation_error": deviation[intensity],
-        "r0_profile": turbulence.fried_parameter(profile.cn2, grid, geometry),
+        "r0_profile": fried,
         "scintillation_index_direct": arrays["scintillation_index"],
         "scintillation_index_profile": turbulence.scintillation_index(profile.cn2, model.matrix, geometry),
         "scintillation_index_point": point,

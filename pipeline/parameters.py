@@ -6,8 +6,10 @@ dimension are text with a unit outside and floats in SI units inside; see :mod:`
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
+from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Annotated, Any, Literal
 
@@ -20,6 +22,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+
 from .geometry import Geometry, SliceGrid
 from .units import (
     Angle,
@@ -41,6 +44,8 @@ from .units import (
 FORMAT, FORMAT_VERSION = "shwfs-frames", 1
 #: Longest text in a header.
 MAX_TEXT = 1000
+#: Deepest nesting of a header.
+MAX_DEPTH = 20
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 
 
@@ -133,6 +138,25 @@ class Configuration(Parameters):
     inversion: InversionParameters = InversionParameters()
 
 
+def overlay(base: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Merge nested tables; lists of tables are merged item by item, everything else is replaced."""
+    merged = dict(base)
+    for key, value in above.items():
+        below = merged.get(key)
+        if isinstance(value, dict) and isinstance(below, dict):
+            merged[key] = overlay(below, value)
+        elif (
+            isinstance(value, list)
+            and isinstance(below, list)
+            and len(value) == len(below)
+            and all(isinstance(item, dict) for item in [*value, *below])
+        ):
+            merged[key] = [overlay(*pair) for pair in zip(below, value, strict=True)]
+        else:
+            merged[key] = value
+    return merged
+
+
 # --- header of a raw archive -------------------------------------------------------------------------------
 
 _angular: ContextVar[bool] = ContextVar("_angular", default=False)
@@ -223,13 +247,6 @@ class Instrument(HeaderPart):
             raise ValueError("a lenslet box must be at least 3 pixels along each axis")
         return pitch
 
-    @field_validator("lenslet_origin")
-    @classmethod
-    def _origin(cls, origin: tuple[int, int]) -> tuple[int, int]:
-        if min(origin) < 0:
-            raise ValueError("the first box must begin on the detector, at (row, col) of 0 or more")
-        return origin
-
 
 class Path(HeaderPart):
     """Line of sight."""
@@ -250,6 +267,40 @@ class Source(HeaderPart):
     """Nominal (row, col) of the spot in a lenslet box, in pixels."""
 
 
+def text_faults(attributes: object) -> list[str]:
+    """What is too long or nested too deeply in a header, whatever the keys are called."""
+    found = []
+
+    def walk(value: object, key: str, depth: int) -> None:
+        if depth > MAX_DEPTH:
+            found.append(f"{key[:MAX_TEXT]} is nested more than {MAX_DEPTH} levels deep")
+        elif isinstance(value, str) and len(value) > MAX_TEXT:
+            found.append(f"{key} holds {len(value)} characters; at most {MAX_TEXT} are allowed")
+        elif isinstance(value, Mapping):
+            for name, item in value.items():
+                walk(item, f"{key}.{name}" if key else str(name)[:MAX_TEXT], depth + 1)
+        elif isinstance(value, (list, tuple)):
+            for number, item in enumerate(value):
+                walk(item, f"{key}[{number}]", depth + 1)
+
+    walk(attributes, "", 0)
+    return found
+
+
+def spot_faults(attributes: Mapping[str, Any]) -> list[str]:
+    """Spots outside their lenslet box, as far as the header can be read."""
+    try:
+        rows, cols = (float(size) for size in attributes["instrument"]["lenslet_pitch"])
+        spots = [tuple(float(x) for x in source["spot"]) for source in attributes["sources"]]
+        return [
+            f"sources[{number}].spot = [{row:g}, {col:g}] lies outside the lenslet box of {rows:g} x {cols:g} pixels"
+            for number, (row, col) in enumerate(spots)
+            if not (-0.5 <= row < rows - 0.5 and -0.5 <= col < cols - 0.5)
+        ]
+    except (KeyError, TypeError, ValueError):
+        return []  # the fields say what is wrong with themselves
+
+
 class Header(HeaderPart):
     """Attributes of a raw archive, format 1."""
 
@@ -266,33 +317,14 @@ class Header(HeaderPart):
     @classmethod
     def _dimension_of_sources(cls, data: Any, handler: ModelWrapValidatorHandler[Header]) -> Header:
         infinite = False
-        try:
+        # A path.length that cannot be read has a fault of its own, reported by its field.
+        with contextlib.suppress(QuantityError, KeyError, TypeError, IndexError):
             infinite = math.isinf(parse(data["path"]["length"], "m", allow_infinite=True))
-        except (QuantityError, KeyError, TypeError, IndexError):
-            pass  # path.length has a fault of its own, reported by its field
         token = _angular.set(infinite)
         try:
             return handler(data)
         finally:
             _angular.reset(token)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short_texts(cls, data: Any) -> Any:
-        def walk(value: Any, key: str, depth: int) -> None:
-            if depth > 20:
-                raise ValueError(f"the header is nested too deeply at {key}")
-            if isinstance(value, str) and len(value) > MAX_TEXT:
-                raise ValueError(f"{key} holds {len(value)} characters; at most {MAX_TEXT} are allowed")
-            if isinstance(value, dict):
-                for name, item in value.items():
-                    walk(item, f"{key}.{name}" if key else str(name)[:MAX_TEXT], depth + 1)
-            elif isinstance(value, (list, tuple)):
-                for number, item in enumerate(value):
-                    walk(item, f"{key}[{number}]", depth + 1)
-
-        walk(data, "", 0)
-        return data
 
     @field_validator("sources")
     @classmethod
@@ -307,14 +339,9 @@ class Header(HeaderPart):
         return sources
 
     @model_validator(mode="after")
-    def _spots_in_boxes(self) -> Header:
-        rows, cols = self.instrument.lenslet_pitch
-        for number, source in enumerate(self.sources):
-            row, col = source.spot
-            if not (-0.5 <= row < rows - 0.5 and -0.5 <= col < cols - 0.5):
-                raise ValueError(
-                    f"sources[{number}].spot = [{row:g}, {col:g}] lies outside the lenslet box of {rows} x {cols} pixels"
-                )
+    def _texts_and_spots(self) -> Header:
+        if faults := [*text_faults(self.model_dump()), *spot_faults(self.model_dump())]:
+            raise ValueError("; ".join(faults))
         return self
 
     def geometry(self) -> Geometry:

@@ -74,36 +74,31 @@ def plan(
     from ...catalog.store import Catalog
     from ...pipeline.units import safe
     from ..cli import complain
+    from ..driver import kept_of
     from ..plan import plan_archive
     from ..settings import InputError
 
     settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
     faults: list[str] = []
     frames = computed = 0
-    catalog = Catalog.open(settings.output, create=False) if settings.output.exists() else None
+    catalog = Catalog(settings.output, create=False) if (settings.output / "catalog.sqlite").exists() else None
+    kept, _ = kept_of(settings.output.absolute())
     for url in settings.archives:
         try:
             planned = plan_archive(url, settings)
         except (ArchiveError, InputError) as error:
             faults += error.faults
             continue
-        digest, reduction = str(planned.profile_key), str(planned.reduction_key)
-        if catalog is not None and catalog.has(planned.archive.identity, digest) is not None:
+        if catalog is not None and catalog.has(planned.archive.identity, planned.profile_key):
             click.echo(f"{planned.name}: {len(planned.windows)} batches, already in the catalog")
             continue
-        new = list(planned.windows)
-        if catalog is not None:
-            new = [
-                window
-                for window in new
-                if not catalog.scratch.load_arrays("correlation", reduction, str(window.start_time))
-            ]
+        new = [window for window in planned.windows if not kept.has(planned.correlation_key(window))]
         read = sum(window.stop - window.start for window in new)
         frames += read
         computed += len(planned.windows)
         click.echo(
             f"{safe(planned.name)}: {len(planned.windows)} batches to compute, {len(planned.windows) - len(new)} "
-            f"from kept correlations, {read} frames to read  (key {digest[:16]})"
+            f"from kept correlations, {read} frames to read  (key {str(planned.profile_key)[:16]})"
         )
     click.echo(f"in all {computed} batches to compute, {frames} frames to read")
     if faults:

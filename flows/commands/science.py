@@ -187,8 +187,8 @@ def response(
         source=str([model.identity() for model in settings.source_models(header, origin)]),
         wavelength=geometry.wavelength,
         path_length=geometry.path_length,
-        convention="data = M @ cn2, cn2 in m^(-2/3); slope rows rad^2, intensity rows 1; d_ab = r_a - r_b with a on the "
-        "first source and b on the second; x along columns, y along rows",
+        convention="data = M @ cn2, cn2 in m^(-2/3); slope rows rad^2, intensity rows 1; d_ab = r_a - r_b with a on "
+        "the first source and b on the second; x along columns, y along rows",
     )
     click.echo(f"{output}: M {matrix.shape[0]} x {matrix.shape[1]}, {int(geometry.valid.sum())} rows measured")
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import sys
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
 
 _CAMPAIGN = """\
 # A coslidar campaign. Quantities are text with their unit: "3 min", "7 cm". Lines that begin with # show defaults.
@@ -93,7 +98,81 @@ def init(folder: Path, scenario: str | None, force: bool) -> None:
 
 
 def _simulate(scenario: str, folder: Path, force: bool) -> dict[str, Any]:
-    raise NotImplementedError
+    """Make the recordings of a scenario that are not there yet; say how long a batch of them should be."""
+    from ...pipeline.units import text
+    from ..simulate import load_scenario, simulate
+
+    loaded = load_scenario(scenario)
+    with simulation_progress() as progress:
+        simulate(loaded, folder, overwrite=force, keep=not force, progress=progress)
+    shortest = min(archive.duration for archive in loaded.archives)
+    return {"campaign": loaded.header.campaign, "batch": text(shortest, "s") if shortest < 180 else None}
+
+
+@contextmanager
+def simulation_progress() -> Iterator[Callable[[str, int, int], None]]:
+    """Bars on a terminal, one line per archive elsewhere."""
+    if not sys.stderr.isatty():
+
+        def line(name: str, done: int, total: int) -> None:
+            if done == total:
+                click.echo(f"coslidar: {name}: {total} frames simulated", err=True)
+
+        yield line
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def bar(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(f"simulating {name}", total=total)
+            bars.update(tasks[name], completed=done)
+
+        yield bar
+
+
+@click.command()
+@click.argument("scenario")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path),
+              help="Archive (X.zarr or X.zarr.zip), or a folder for the archives of a scenario.")  # fmt: skip
+@click.option("--duration", help="Length of each recording instead of the scenario's: '20 s'.")
+@click.option("--seed", type=int, help="Seed instead of the scenario's.")
+@click.option("--codec", type=click.Choice(["lz4", "zstd"]), default="lz4", show_default=True, help="Fast, or small.")
+@click.option("--force", is_flag=True, help="Replace archives that are there.")
+def simulate(scenario: str, output: Path, duration: str | None, seed: int | None, codec: Any, force: bool) -> None:
+    """Make recordings whose truth is known, by first-order theory in spherical waves.
+
+    SCENARIO is the name of a shipped scenario ('coslidar simulate list -o .' names them) or a file. The truth of
+    X.zarr.zip is written beside it as X.truth.json.
+    """
+    from ...pipeline.units import QuantityError, parse
+    from ..settings import InputError
+    from ..simulate import shipped
+    from ..simulate import simulate as make
+
+    if scenario == "list":
+        for name, line in shipped().items():
+            click.echo(f"{name:<20} {line}")
+        return
+    seconds = None
+    if duration is not None:
+        try:
+            seconds = parse(duration, "s", key="--duration")
+        except QuantityError as error:
+            raise InputError([f"--duration = {duration!r}: {error}"]) from error
+    try:
+        with simulation_progress() as progress:
+            written = make(
+                scenario, output, duration=seconds, seed=seed, codec=codec, overwrite=force, progress=progress
+            )
+    except FileExistsError as error:
+        raise InputError([f"{error}; replace it with --force"]) from error
+    for path in written:
+        click.echo(path)
 
 
 @click.command()
