@@ -425,12 +425,17 @@ def _legendre(n: int) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class _Shell:
-    """Nodes of one shell: radii (n,), weights of dr (n,), angles (m,) of a quadrant or the half circle, taper (n,)."""
+    """Nodes of one shell.
+
+    Radii (n,), weights of dr (n,), angles (m,) of a quadrant or the half circle, a taper (n,) that ends the shell
+    smoothly, and, (n,), what is left of the oscillation cos 2X and sin 2X of diffraction (None: all of it).
+    """
 
     f: Array
     weight: Array
     angle: Array
     taper: Array
+    fringes: Array | None
 
 
 def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterator[_Shell]:
@@ -439,13 +444,15 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
     A Gauss-Legendre panel of n nodes over a phase of 2a is in error by about (a / 2)^(2n) / (2n)!, which 0.42 nodes per
     radian and 8 more hold below 1e-9; a trapezoidal rule over a circle at which the phase reaches x is in error by the
     Bessel function J_n(x), which falls below 1e-10 for n = x + 8 x^(1/3).
+
+    The phase 2X of diffraction grows as f^2. Where it outruns by far every other phase, no point of the integrand is
+    stationary and its oscillation leaves nothing in the maps: it is faded out there instead of followed to the end.
     """
     geometry = model.geometry
-    bend = 2 * math.pi * geometry.wavelength * max(float(a) * geometry.scaling(float(a)) for a in z)
+    bends = [2 * math.pi * geometry.wavelength * float(a) * geometry.scaling(float(a)) for a in z]
+    bend = max(bends)
     swing = 2 * math.pi * reach
-
-    def phase(f: float) -> float:
-        return swing * f + bend * f * f
+    fade = max(2 * swing / min(bends), math.sqrt(300 / min(bends))) if min(bends) else math.inf
 
     start = min(3 / swing, 1 / math.sqrt(bend) if bend else math.inf)
     edges = [0.0] + [start * 8.0**-level for level in range(4, 0, -1)]
@@ -454,22 +461,28 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
         edges.append(outer)
         radii, weights, inner = [], [], edges[0]
         for a, b in itertools.pairwise(edges):
-            panels = max(1, math.ceil((phase(b) - phase(a)) / 60))
-            nodes, rule = _legendre(math.ceil(resolution * (_NODES_PER_RADIAN * (phase(b) - phase(a)) / panels + 8)))
+            turned = swing * (b - a) + (bend * (b * b - a * a) if a < _SHELL_RATIO * fade else 0.0)
+            panels = max(1, math.ceil(turned / 60))
+            nodes, rule = _legendre(math.ceil(resolution * (_NODES_PER_RADIAN * turned / panels + 8)))
             cuts = np.linspace(a, b, panels + 1) ** (1 / model.power)
             half = np.diff(cuts)[:, None] / 2
             u = (cuts[:-1, None] + half) + half * nodes
             radii.append((u**model.power).ravel())
             weights.append((half * rule * model.power * u ** (model.power - 1)).ravel())
         f = np.concatenate(radii)
-        x = np.clip((f - inner) / (outer - inner), 0, 1)
         turn = swing * outer
         span = np.pi / 2 if model.even else np.pi
         angles = math.ceil(resolution * (turn + 8 * turn ** (1 / 3) + 16) * span / (2 * np.pi))
         angle = span * (np.arange(angles) + 0.5) / angles
-        # Smooth to the fourth derivative: a sharp edge would ring in the maps of far separations.
-        yield _Shell(f, np.concatenate(weights), angle, 1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3))
+        fringes = _fall((f / fade - 1) / (_SHELL_RATIO - 1)) if outer > fade else None
+        yield _Shell(f, np.concatenate(weights), angle, _fall((f - inner) / (outer - inner)), fringes)
         edges, outer = [outer], outer * _SHELL_RATIO
+
+
+def _fall(x: Array) -> Array:
+    """1 for x < 0, 0 for x > 1, with three continuous derivatives: a sharp edge would ring in the maps."""
+    x = np.clip(x, 0.0, 1.0)
+    return np.asarray(1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3))
 
 
 def _integrate(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], floor: Array, resolution: float) -> Array:
@@ -528,7 +541,8 @@ def _shell_maps(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], s
         f = shell.f[part, None]
         fx, fy = f * cosine, f * sine
         along_x, along_y = _harmonics(fx.ravel(), d, q), _harmonics(fy.ravel(), d, p)
-        densities = _densities(model, z, fx, fy, tuple(values[:, part, None] for values in radial), kinds)
+        own = tuple(values[:, part, None] for values in radial)
+        densities = _densities(model, z, fx, fy, own, kinds, shell.fringes is None)
         basis: dict[int, Array] = {}
         for block, products, density in densities:
             # (layers, kinds, radii, angles) -> (whole or tapered, rules, kinds, nodes)
@@ -562,13 +576,18 @@ def _harmonics(f: Array, d: float, n: int) -> tuple[Array, Array]:
 
 
 def _radial(model: _Model, z: Array, shell: _Shell) -> tuple[Array, Array, Array]:
-    """Weighted index spectrum, cos X and sin X of every layer and radius, (layers, radii) each."""
+    """Weighted index spectrum, cos X and sin X of every layer and radius, (layers, radii) each.
+
+    Where the fringes fade, what is left of cos 2X and sin 2X instead.
+    """
     scaling = np.array([model.geometry.scaling(float(a)) for a in z])[:, None]
     x = np.pi * model.geometry.wavelength * z[:, None] * scaling * shell.f**2
     # The rest of the circle holds the same values, or their complex conjugates.
     measure = shell.weight * shell.f * (2 * np.pi / shell.angle.size)
     spectrum = np.stack([model.spectrum.psd(float(a) * shell.f) for a in scaling[:, 0]])
-    return scaling**2 * spectrum * measure, np.cos(x), np.sin(x)
+    if shell.fringes is None:
+        return scaling**2 * spectrum * measure, np.cos(x), np.sin(x)
+    return scaling**2 * spectrum * measure, shell.fringes * np.cos(2 * x), shell.fringes * np.sin(2 * x)
 
 
 def _aperture(model: _Model, fx: Array, fy: Array) -> tuple[Array, Array, Array]:
@@ -595,29 +614,60 @@ def _spherical_j1(x: Array) -> Array:
     return np.where(small, x / 3 * (1 - x**2 / 10), (np.sin(safe) / safe - np.cos(safe)) / safe)
 
 
+_Amplitudes = list[tuple["NDArray[Any]", "NDArray[Any]"]]
+
+
 def _amplitudes(
-    model: _Model, m: float, fx: Array, fy: Array, filters: tuple[Array, Array, Array], c: Array, s: Array
-) -> list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]:
-    """Amplitudes of slopes x and y, times i, and of scintillation, for each source; real for even sources."""
-    mean, tilt_x, tilt_y = filters
+    model: _Model, m: float, fx: Array, fy: Array, filters: tuple[Array, Array, Array]
+) -> list[_Amplitudes]:
+    """Factors of cos X and sin X in the amplitudes of slopes x and y, times i, and of scintillation, for each source.
+
+    They are real for even sources.
+    """
+    mean, *tilts = filters
     amplitudes = []
     for source, centroid in zip(model.sources, model.centroids, strict=True):
         transfer = source.transfer(m * fx, m * fy)
         transfer = np.real(transfer) if model.even else np.conj(transfer)
-        seen = c * transfer
-        slopes = [tilt_x * seen, tilt_y * seen]
+        seen = mean * transfer
+        bright: list[NDArray[Any]] = [np.zeros(1), np.zeros(1)]
         if model.centroid_term:
-            bright = (model.centroid_term * s) * mean
-            for slope, moment, centre in zip(slopes, source.moment(m * fx, m * fy), centroid, strict=True):
+            moments = source.moment(m * fx, m * fy)
+            for axis, (moment, centre) in enumerate(zip(moments, centroid, strict=True)):
                 # i conj(M), whose real part is the imaginary part of M.
                 about = np.imag(moment) if model.even else 1j * (np.conj(moment) - centre * transfer)
-                slope += bright * about
-        amplitudes.append((slopes[0], slopes[1], (2 * model.wavenumber * s) * mean * transfer))
+                bright[axis] = (model.centroid_term * mean) * about
+        slopes = [(tilt * transfer, term) for tilt, term in zip(tilts, bright, strict=True)]
+        amplitudes.append([*slopes, (np.zeros(1), (2 * model.wavenumber) * seen)])
     return amplitudes
 
 
+def _product(
+    first: tuple[NDArray[Any], NDArray[Any]],
+    second: tuple[NDArray[Any], NDArray[Any]],
+    radial: tuple[Array, Array, Array],
+    coherent: bool,
+) -> NDArray[Any]:
+    """Density of the product of two amplitudes, first times conj(second)."""
+    power, c, s = radial
+    if coherent:
+        a = c * first[0] + s * first[1]
+        if first is second:
+            return np.asarray(power * (a * a if not np.iscomplexobj(a) else np.abs(a) ** 2))
+        return np.asarray(power * (a * np.conj(c * second[0] + s * second[1])))
+    tilts, glints = first[0] * np.conj(second[0]), first[1] * np.conj(second[1])
+    mixed = first[0] * np.conj(second[1]) + first[1] * np.conj(second[0])
+    return np.asarray(power / 2 * ((1 + c) * tilts + (1 - c) * glints + s * mixed))
+
+
 def _densities(
-    model: _Model, z: Array, fx: Array, fy: Array, radial: tuple[Array, ...], kinds: tuple[int, ...]
+    model: _Model,
+    z: Array,
+    fx: Array,
+    fy: Array,
+    radial: tuple[Array, ...],
+    kinds: tuple[int, ...],
+    coherent: bool,
 ) -> list[tuple[slice, tuple[tuple[int, int], ...], Array]]:
     """Spectral densities of the kinds: for each block of kinds the products it enters, with sign, and the density.
 
@@ -626,7 +676,6 @@ def _densities(
     with the phase a of the separation and b of the shift between the sources.
     """
     geometry = model.geometry
-    spectrum, cos_x, sin_x = radial
     filters = _aperture(model, fx, fy)
     crossed, own = kinds[-1] in _CROSS, kinds[0] in _AUTO
     autos = np.empty((z.size, 3, *fx.shape)) if own else None
@@ -634,23 +683,21 @@ def _densities(
     phases = [2 * np.pi * s * f if s else None for s, f in zip(geometry.separation, (fx, fy), strict=True)]
     for layer, distance in enumerate(z):
         m = geometry.magnification(float(distance))
-        amplitudes = _amplitudes(model, m, fx, fy, filters, cos_x[layer], sin_x[layer])
-        power = spectrum[layer]
+        amplitudes = _amplitudes(model, m, fx, fy, filters)
+        here = (radial[0][layer], radial[1][layer], radial[2][layer])
+        turns = _turns(phases, m, model.even) if crossed else {}
         for kind in range(3):
-            a, b = amplitudes[0][kind], amplitudes[-1][kind]
-            both = power * (a * np.conj(b))
-            if autos is not None:
-                autos[layer, kind] = np.real(both) if a is b else power / 2 * (np.abs(a) ** 2 + np.abs(b) ** 2)
-            if crossed:
-                if kind == 0:
-                    turns = _turns(phases, m, model.even)
-                for product, turn in turns.items():
-                    values = terms.setdefault(product, np.empty((z.size, 3, *fx.shape)))
-                    if model.even:
-                        np.multiply(both, turn, out=values[layer, kind])
-                    else:
-                        shifted = both * turn
-                        values[layer, kind] = np.real(shifted) if product == _COS_COS else np.imag(shifted)
+            first, second = amplitudes[0][kind], amplitudes[-1][kind]
+            density = _product(first, second, here, coherent)
+            if autos is not None and first is second:
+                autos[layer, kind] = np.real(density)
+            elif autos is not None:
+                each = [np.real(_product(one, one, here, coherent)) for one in (first, second)]
+                autos[layer, kind] = (each[0] + each[1]) / 2
+            for product, turn in turns.items():
+                values = terms.setdefault(product, np.empty((z.size, 3, *fx.shape)))
+                shifted = density * turn
+                values[layer, kind] = np.imag(shifted) if product == _SIN_COS and not model.even else np.real(shifted)
     blocks: list[tuple[slice, tuple[tuple[int, int], ...], Array]] = []
     if autos is not None:
         blocks.append((slice(0, 3), ((_COS_COS, 1),) if model.even else ((_COS_COS, 1), (_SIN_SIN, -1)), autos))
@@ -670,10 +717,10 @@ def _turns(phases: list[Array | None], m: float, even: bool) -> dict[int, NDArra
         return {_COS_COS: turn, _SIN_COS: turn}
     x, y = (None if phase is None else (np.cos(m * phase), np.sin(m * phase)) for phase in phases)
     if x is None or y is None:
-        turns: dict[int, NDArray[Any]] = {}
+        turns: dict[int, NDArray[Any]] = {_COS_COS: np.ones(1)}
         if y is not None:
-            turns |= {_COS_COS: y[0], _SIN_COS: y[1]}
+            turns = {_COS_COS: y[0], _SIN_COS: y[1]}
         if x is not None:
-            turns |= {_COS_COS: x[0], _COS_SIN: x[1]}
+            turns = {_COS_COS: x[0], _COS_SIN: x[1]}
         return turns
     return {_COS_COS: x[0] * y[0], _SIN_COS: x[0] * y[1], _COS_SIN: x[1] * y[0], _SIN_SIN: x[1] * y[1]}
