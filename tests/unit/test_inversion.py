@@ -497,3 +497,43 @@ def test_inputs_stay_writable_and_untouched(case):
     for before, after in zip(case, copies, strict=True):
         np.testing.assert_array_equal(before, after)
         assert after.flags.writeable
+
+
+# --- estimators ---------------------------------------------------------------------------------------------
+
+
+def test_estimators_share_everything_but_the_profile(case):
+    mode, mean = invert(case), invert(case, estimator="posterior_mean")
+    np.testing.assert_array_equal(mean.cn2, mean.posterior.mean)
+    np.testing.assert_array_equal(mode.interval_95, mean.interval_95)
+    np.testing.assert_array_equal(mode.error_map, mean.error_map)
+    np.testing.assert_array_equal(mode.at_bound, mean.at_bound)
+    assert (mean.cn2 > 0).all()
+    assert (mode.interval_68[:, 0] >= mode.interval_95[:, 0]).all()
+    assert mode.chi2 < mean.chi2, "the mode is the best fit but for the prior"
+    assert (mode.estimator, mean.estimator) == ("map", "posterior_mean")
+
+
+def test_no_posterior_means_no_bound(case):
+    """Two slices with equal responses and no prior: nothing tells one from the other."""
+
+    class Nothing:
+        version = 1
+
+        def precision(self, grid):
+            return np.zeros((grid.k, grid.k))
+
+    data, covariance, matrix = case
+    matrix = matrix.copy()
+    matrix[:, 1] = matrix[:, 0]
+    options = {"grid": GRID, "regulariser": Nothing(), "selector": Fixed(1e27)}
+    found = inversion.invert(data, covariance, matrix, **options)
+    assert found.posterior is None
+    np.testing.assert_array_equal(found.interval_95, np.tile([0, np.inf], (12, 1)))
+    with pytest.raises(ValueError, match="no posterior mean"):
+        inversion.invert(data, covariance, matrix, estimator="posterior_mean", **options)
+
+
+def test_unknown_estimator_lists_the_known_ones(case):
+    with pytest.raises(ValueError, match="no estimator 'median'; there are: map, posterior_mean"):
+        invert(case, estimator="median")
