@@ -104,9 +104,7 @@ def recordings(scenario: Scenario, origin: str = "scenario") -> list[Recording]:
     list of Recording
         One per archive.
     """
-    settings = _settings(scenario, origin)
-    spectrum, sources = settings.spectrum(), settings.source_models(scenario.header, origin)
-    return [scenario.recording(number, spectrum, sources) for number in range(len(scenario.archives))]
+    return [_recording(scenario, number, origin) for number in range(len(scenario.archives))]
 
 
 def simulate(
@@ -118,6 +116,7 @@ def simulate(
     threads: int | None = None,
     codec: Codec | None = None,
     overwrite: bool = False,
+    keep: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> list[Path]:
     """Write every archive of a scenario, and the truth of each beside it.
@@ -139,20 +138,22 @@ def simulate(
         Compression of the archives, quick or small, instead of that of the scenario.
     overwrite : bool
         Replace archives that are there already.
+    keep : bool
+        Leave archives that are there already with their truth as they are.
     progress : callable, optional
         Called with (name of the archive, frames written, frames in all).
 
     Returns
     -------
     list of pathlib.Path
-        Archives written. The truth of ``X.zarr.zip`` is ``X.truth.json``.
+        The archives. The truth of ``X.zarr.zip`` is ``X.truth.json``.
 
     Raises
     ------
     InputError
         The scenario has faults, or several archives are to go into one.
     FileExistsError
-        An archive is there already and `overwrite` is false.
+        An archive is there already, and neither `overwrite` nor `keep` is set.
     """
     origin = safe(str(scenario)) if isinstance(scenario, (str, Path)) else "scenario"
     plan = load_scenario(scenario) if isinstance(scenario, (str, Path)) else scenario
@@ -170,11 +171,20 @@ def simulate(
     else:
         output.mkdir(parents=True, exist_ok=True)
     written = []
-    for recording in recordings(plan, origin):
-        name = str(recording.attributes["archive"])
-        path = output if single else output / f"{name}{SUFFIX}"
-        write_recording(recording, path, threads=threads, codec=codec, overwrite=overwrite, progress=progress)
+    for number, archive in enumerate(plan.archives):
+        path = output if single else output / f"{archive.archive}{SUFFIX}"
         written.append(path)
+        if keep and path.exists() and truth_path(path).exists():
+            continue
+        # Without its truth an archive is what an interrupted command left behind.
+        write_recording(
+            _recording(plan, number, origin),
+            path,
+            threads=threads,
+            codec=codec,
+            overwrite=overwrite or keep,
+            progress=progress,
+        )
     return written
 
 
@@ -266,11 +276,16 @@ def simulate_recording(
     first = plan.archives[0].model_validate({**plan.archives[0].model_dump(mode="json"), "duration": duration})
     calm = plan.disturbances.model_copy(update={"dropped": 0.0})
     plan = plan.model_copy(update={"archives": (first,), "disturbances": calm})
-    recording = recordings(plan)[0]
+    recording = _recording(plan, 0, scenario)
     exact = replace(recording, time=recording.time[:frames], index=recording.index[:frames])
     path.parent.mkdir(parents=True, exist_ok=True)
     write_recording(exact, path, threads=threads, codec=codec, overwrite=overwrite)
     return path
+
+
+def _recording(scenario: Scenario, number: int, origin: str) -> Recording:
+    settings = _settings(scenario, origin)
+    return scenario.recording(number, settings.spectrum(), settings.source_models(scenario.header, origin))
 
 
 def _settings(scenario: Scenario, origin: str) -> Settings:
