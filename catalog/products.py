@@ -253,7 +253,7 @@ def _delivered(results: Sequence[BatchResult], sizes: Mapping[str, int]) -> list
         names = {
             name
             for name, promised in SCHEMA.items()
-            if "time" in promised.dims and all(dim in sizes for dim in promised.dims)
+            if name not in own and "time" in promised.dims and all(dim in sizes for dim in promised.dims)
         }
     for name in sorted(names & own):
         raise ProductError(f"{name}: the product takes it from the batch itself; no stage delivers it")
@@ -437,6 +437,25 @@ def product_bytes(dataset: xr.Dataset) -> bytes:
             entry.create_system, entry.external_attr = 3, 0o644 << 16
             archive.writestr(entry, members[name])
     return packed.getvalue()
+
+
+def fingerprint(dataset: xr.Dataset) -> str:
+    """Hash of a product without its provenance: the same as long as lineage and numbers are.
+
+    The file itself also changes with the commit and the versions of the software that made it, since they stand in
+    its provenance.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        See :func:`assemble`.
+
+    Returns
+    -------
+    str
+        sha256, 64 hexadecimal digits.
+    """
+    return hashlib.sha256(product_bytes(dataset.assign_attrs(provenance=""))).hexdigest()
 
 
 def _document(content: Mapping[str, Any]) -> bytes:

@@ -104,8 +104,9 @@ class Scratch:
         BatchResult or None
             None where it is not there, damaged, of another key, or holds what a product does not know.
         """
+        path = self.path(key)
         try:
-            with np.load(self.path(key), allow_pickle=False) as packed:
+            with np.load(path, allow_pickle=False) as packed:
                 meta = json.loads(str(packed[_META]))
                 if meta["format"] != _FORMAT or meta["key"] != str(key):
                     return None

@@ -1,0 +1,64 @@
+"""Products with drawn numbers, for tests of what keeps them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from coslidar.catalog.products import assemble
+from coslidar.pipeline.lineage import make_key
+from coslidar.pipeline.products import SCHEMA, BatchResult
+
+#: 2012-09-14T12:15:00 UTC, in ns; not a whole microsecond, so that rounding would show.
+START = 1347624900000000123
+LENGTH = 180 * 10**9
+IDENTITY = "0123456789abcdef" * 4
+_OWN = ("time_bounds", "quality_flag", "quality_level")
+
+
+def batch(number=0, seed=0, *, slices=4, grid=5, flag=0):
+    """A batch in which every variable of the schema has drawn values."""
+    random = np.random.default_rng([seed, number])
+    sizes = {"z": slices, "z_true": slices, "log_mu_grid": grid, "slope_kind": 4, "intensity_kind": 2}
+    sizes |= {"dy": 5, "dx": 3, "source": 2, "axis": 2, "axis_kind": 3, "bound": 2}
+    values = {
+        name: (10 * random.random([sizes[dim] for dim in variable.dims[1:]])).astype(variable.dtype)
+        for name, variable in SCHEMA.items()
+        if variable.dims[0] == "time" and name not in _OWN and all(dim in sizes for dim in variable.dims[1:])
+    }
+    values["log_mu_grid"] = np.linspace(25.0, 29.0, grid)
+    return BatchResult(START + number * LENGTH, START + (number + 1) * LENGTH, values, flag)
+
+
+def failed(number):
+    return BatchResult(START + number * LENGTH, START + (number + 1) * LENGTH, {}, 1, "no light")
+
+
+def static(slices=4):
+    edges = np.linspace(0.0, 2670.0, slices + 1)
+    return {
+        "z": (edges[1:] + edges[:-1]) / 2,
+        "z_bounds": np.stack([edges[:-1], edges[1:]], axis=1),
+        "dy": np.arange(-2, 3) * 0.07,
+        "dx": np.arange(-1, 2) * 0.07,
+        "pair_count": np.arange(15).reshape(5, 3),
+    }
+
+
+def key(seed=0):
+    measured = make_key("measurements", 1, {"archive": IDENTITY})
+    return make_key("profile", 1, {"seed": seed}, upstream=[measured])
+
+
+def product(seed=0, results=None, **changes):
+    """A product of two good batches and a failed one."""
+    given = {
+        "campaign": "test-campaign",
+        "archive": "2012-09-14T1415",
+        "archive_identity": IDENTITY,
+        "lineage": key(seed),
+        "wavelength": 3.8e-6,
+        "sources": ["bottom", "top"],
+        "attributes": {"sampling": "mean"},
+    } | changes
+    batches = [batch(0, seed), batch(1, seed, flag=4), failed(2)] if results is None else results
+    return assemble(batches, static(), **given)
