@@ -101,7 +101,8 @@ def product(
         "averaging_kernel": np.repeat(kernel[None], batches, axis=0),
         "degrees_of_freedom": np.full(batches, np.trace(kernel)),
         "mu": 10**log_mu,
-        "criterion": 1e-3 * (1 + 0.02 * np.logaddexp(0, 3 * (grid - log_mu[:, None])) + 0.01 * np.logaddexp(0, log_mu[:, None] - grid)),
+        "criterion": 1e-3 + 1e-5 * (2 * np.logaddexp(0, 3 * (grid - log_mu[:, None]))
+                                    + np.logaddexp(0, log_mu[:, None] - grid)),
         "slope_correlation": slopes,
         "slope_correlation_model": slope_model,
         "slope_correlation_error": slope_error,

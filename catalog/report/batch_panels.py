@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...pipeline.geometry import MAP_KINDS
 from .reading import Floats, Maps, edges, log_mu, maps, of_batch, scalar
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
     from xarray import Dataset
+
+Flags = NDArray[np.bool_]
 
 #: Titles of the correlation maps.
 KIND_TITLES = {
@@ -46,7 +49,7 @@ def _note(ax: Axes, text: str) -> Axes:
     return ax
 
 
-def _plain(value: float, _: int | None = None) -> str:
+def _plain(value: float, _: float = 0) -> str:
     return f"{value:.6g}".replace("-", "−")
 
 
@@ -63,7 +66,7 @@ def _ticks(axis: Axis, lags: Floats) -> None:
     axis.set_tick_params(labelsize=11)
 
 
-def _limits(dataset: Dataset, batch: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, Floats, Floats]:
+def _limits(dataset: Dataset, batch: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, Flags, Floats]:
     """MAP bars, ML bars, whether the bound is active, and the upper limit there."""
     blank = np.full(shape, np.nan)
     cn2 = of_batch(dataset, "cn2", batch)
@@ -73,7 +76,7 @@ def _limits(dataset: Dataset, batch: int, shape: tuple[int, ...]) -> tuple[Float
     interval = of_batch(dataset, "cn2_interval_95", batch)
     cn2 = blank if cn2 is None else cn2
     error = blank if error is None else error
-    active = np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0
+    active: Flags = np.asarray(np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0)
     upper = interval[..., 1] if interval is not None else cn2 + 2 * error
     return error, blank if error_ml is None else error_ml, active, np.where(active, upper, np.nan)
 
@@ -117,7 +120,7 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     ax.stairs(np.where(shown, cn2, bottom), border, baseline=bottom, fill=True, color=BLUE, alpha=0.13, lw=0)
     ax.stairs(steps, border, baseline=None, color=BLUE, lw=2.2, label="retrieved")
 
-    def bars(at: Floats, bar: Floats, where: np.ndarray, **style: object) -> None:
+    def bars(at: Floats, bar: Floats, where: Flags, **style: object) -> None:
         # On a logarithmic axis a bar that reaches below zero ends under the axis, not nowhere.
         here = where & np.isfinite(bar) & (bar > 0)
         low = np.minimum(bar, cn2 - np.minimum(cn2, bottom) / 2)
@@ -142,8 +145,8 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     ax.grid(axis="y", which="major")
     handles, labels = ax.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: _LEGEND.index(labels[i]))
-    ax.legend([handles[i] for i in order], [labels[i] for i in order], loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncol=5,
-              columnspacing=1.4, handletextpad=0.5)  # fmt: skip
+    ax.legend([handles[i] for i in order], [labels[i] for i in order], loc="lower left", bbox_to_anchor=(-0.01, 1.0),
+              ncol=5, columnspacing=1.4, handletextpad=0.5)  # fmt: skip
     return ax
 
 
@@ -162,7 +165,8 @@ def describe_profile(dataset: Dataset, batch: int) -> str:
     peak = int(np.nanargmax(cn2))
     text = (
         f"Cn² in {cn2.size} slices from {number(border[0], 4)} to {number(border[-1], 4)} m. The strongest slice, "
-        f"{number(border[peak], 4)} to {number(border[peak + 1], 4)} m, holds {measured(cn2[peak], error[peak])} m^(-2/3)."
+        f"{number(border[peak], 4)} to {number(border[peak + 1], 4)} m, holds "
+        f"{measured(cn2[peak], error[peak])} m^(-2/3)."
     )
     count = int(active.sum())
     return text + (f" {count} of the slices {'is' if count == 1 else 'are'} at the bound of zero." if count else "")
@@ -271,7 +275,7 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
 
     def scale(image: AxesImage, x: float, low: float, high: float, label: str, extend: str = "neither") -> None:
         drawn = figure.colorbar(image, cax=axes(x, low, 0.13, high - low), extend=extend)
-        drawn.outline.set_linewidth(0.6)  # type: ignore[operator]
+        drawn.outline.set_linewidth(0.6)
         drawn.ax.yaxis.set_major_formatter(_plain)
         drawn.ax.tick_params(labelsize=11)
         drawn.ax.set_title(label, fontsize=11, loc="left", pad=7)
@@ -388,8 +392,8 @@ def describe_criterion(dataset: Dataset, batch: int) -> str:
         return f"There is no criterion curve; log10(mu) is {number(chosen, 4)}."
     least = float(grid[np.nanargmin(curve)])
     return (
-        f"Criterion for log10(mu) from {number(float(grid[0]), 4)} to {number(float(grid[-1]), 4)}. Its minimum on the grid is at "
-        f"{number(least, 4)}; the chosen value is {number(chosen, 4)}."
+        f"Criterion for log10(mu) from {number(float(grid[0]), 4)} to {number(float(grid[-1]), 4)}. "
+        f"Its minimum on the grid is at {number(least, 4)}; the chosen value is {number(chosen, 4)}."
     )
 
 
@@ -404,8 +408,9 @@ def draw_averaging_kernels(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     columns = rows if kernel.shape[0] == kernel.shape[1] else borders(np.asarray(dataset["z_true"].values, float))
     limit = float(np.nanmax(np.abs(kernel))) or 1.0
     if all(np.allclose(np.diff(border), border[1] - border[0]) for border in (rows, columns)):
-        image = ax.imshow(np.ma.masked_invalid(kernel), origin="lower", interpolation="none", aspect="auto", cmap=DIVERGING,
-                          vmin=-limit, vmax=limit, extent=(columns[0], columns[-1], rows[0], rows[-1]))  # fmt: skip
+        image = ax.imshow(np.ma.masked_invalid(kernel), origin="lower", interpolation="none", aspect="auto",
+                          cmap=DIVERGING, vmin=-limit, vmax=limit,
+                          extent=(columns[0], columns[-1], rows[0], rows[-1]))  # fmt: skip
     else:
         image = ax.pcolormesh(columns, rows, np.ma.masked_invalid(kernel), cmap=DIVERGING, vmin=-limit, vmax=limit,
                               rasterized=True)  # type: ignore[assignment] # fmt: skip
@@ -413,7 +418,7 @@ def draw_averaging_kernels(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     ax.plot(ends, ends, color=INK, lw=1, ls=":")
     ax.set_xlabel("true distance z (m)")
     ax.set_ylabel("retrieved distance z (m)")
-    scale = ax.figure.colorbar(image, ax=ax, fraction=0.05, pad=0.03)  # type: ignore[union-attr]
+    scale = ax.figure.colorbar(image, ax=ax, fraction=0.05, pad=0.03)
     scale.outline.set_linewidth(0.6)
     scale.ax.set_title("response", fontsize=12, loc="left", pad=8)
     scale.ax.yaxis.set_major_formatter(_plain)

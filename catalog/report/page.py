@@ -105,10 +105,10 @@ BATCH_PANELS = (
     BatchPanel(
         "profile",
         "How does Cn² vary along the line of sight?",
-        "A step is one slice. The bar with a filled circle is the MAP error (1 sigma); the bar with an open diamond is the "
-        "maximum-likelihood error, from the data alone: where it is much longer, the prior decides. A bar with an arrow is "
-        "a slice that the positivity constraint holds at zero; it marks zero plus two MAP errors, or the upper end of the "
-        "95 % interval where the product has one.",
+        "A step is one slice. The bar with a filled circle is the MAP error (1 sigma); the bar with an open "
+        "diamond is the maximum-likelihood error, from the data alone: where it is much longer, the prior decides."
+        " A bar with an arrow is a slice that the positivity constraint holds at zero; it marks zero plus two MAP "
+        "errors, or the upper end of the 95 % interval where the product has one.",
         (10.0, 4.6),
         one.compose_profile,
         one.describe_profile,
@@ -116,10 +116,10 @@ BATCH_PANELS = (
     BatchPanel(
         "correlations",
         "Does the profile explain the measured correlations?",
-        "Each map shows a correlation against the separation of two subapertures, dx to the right and dy upward; separations "
-        "without a pair are blank. Measured and model share a scale for all slope maps, and one for both scintillation maps. "
-        "Residuals are (measured − model) in units of their error: an rms near 1 is a good fit, and a plus or minus sign marks "
-        "more than 3 errors. The last row cuts the maps at dx = 0.",
+        "Each map shows a correlation against the separation of two subapertures, dx to the right and dy upward; "
+        "separations without a pair are blank. Measured and model share a scale for all slope maps, and one for "
+        "both scintillation maps. Residuals are (measured − model) in units of their error: an rms near 1 is a "
+        "good fit, and a plus or minus sign marks more than 3 errors. The last row cuts the maps at dx = 0.",
         one.CORRELATION_SIZE,
         one.compose_correlations,
         one.describe_correlations,
@@ -127,8 +127,8 @@ BATCH_PANELS = (
     BatchPanel(
         "criterion",
         "How was the strength of the regularisation chosen?",
-        "The curve is the criterion for each μ; μ is the inverse of the a priori variance of the profile. The diamond on the "
-        "dashed line is the value used. A flat curve means that the data hardly tell.",
+        "The curve is the criterion for each μ; μ is the inverse of the a priori variance of the profile. The "
+        "diamond on the dashed line is the value used. A flat curve means that the data hardly tell.",
         (10.0, 3.6),
         one.compose_criterion,
         one.describe_criterion,
@@ -136,9 +136,9 @@ BATCH_PANELS = (
     BatchPanel(
         "kernels",
         "Which part of the path does each slice really see?",
-        "A row tells how one retrieved slice answers to turbulence at each true distance, without the positivity constraint. Ideal: 1 on the dotted "
-        "diagonal. Right: the sum of each row (filled circles; 1 means that the data, not the prior, set the level) and the "
-        "part from the slice's own place (open squares).",
+        "A row tells how one retrieved slice answers to turbulence at each true distance, without the positivity "
+        "constraint. Ideal: 1 on the dotted diagonal. Right: the sum of each row (filled circles; 1 means that the"
+        " data, not the prior, set the level) and the part from the slice's own place (open squares).",
         (10.0, 4.9),
         one.compose_kernels,
         one.describe_kernels,
@@ -149,8 +149,8 @@ TIME_PANELS = (
     TimePanel(
         "map",
         "When and where is the turbulence strong?",
-        "One column per batch, one row per slice; brighter is stronger, on a logarithmic scale taken from the data. Blank: nothing was "
-        "measured. Hatched: the positivity constraint holds the slice at zero.",
+        "One column per batch, one row per slice; brighter is stronger, on a logarithmic scale taken from the "
+        "data. Blank: nothing was measured. Hatched: the positivity constraint holds the slice at zero.",
         (10.0, 4.9),
         over.compose_time_distance,
         over.describe_time_distance,
@@ -159,9 +159,9 @@ TIME_PANELS = (
     TimePanel(
         "strength",
         "Does the profile agree with what the spots show directly?",
-        "Open symbols are measured directly from fluxes and slopes, source by source; filled diamonds are computed from the "
-        "retrieved profile, with aperture and source averaging in the index. Both hold at the instrument's wavelength. Where they differ, the "
-        "profile misses or invents turbulence.",
+        "Open symbols are measured directly from fluxes and slopes, source by source; filled diamonds are computed"
+        " from the retrieved profile, with aperture and source averaging in the index. Both hold at the "
+        "instrument's wavelength. Where they differ, the profile misses or invents turbulence.",
         (10.0, 5.6),
         over.compose_strength,
         over.describe_strength,
@@ -170,8 +170,8 @@ TIME_PANELS = (
     TimePanel(
         "fit",
         "Does the model fit, and is the regularisation steady?",
-        "Above: misfit per independent datum; 1 is what the convergence noise predicts. Below: the hyperparameter μ (m^(4/3)); it rises by "
-        "2 in the logarithm when the turbulence falls by 10.",
+        "Above: misfit per independent datum; 1 is what the convergence noise predicts. Below: the hyperparameter "
+        "μ (m^(4/3)); it rises by 2 in the logarithm when the turbulence falls by 10.",
         (10.0, 4.8),
         over.compose_fit,
         over.describe_fit,
@@ -180,7 +180,8 @@ TIME_PANELS = (
     TimePanel(
         "quality",
         "Which batches need care?",
-        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number behind its name counts the batches.",
+        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number "
+        "behind its name counts the batches.",
         (10.0, 4.3),
         over.compose_quality,
         over.describe_quality,
@@ -274,6 +275,15 @@ def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
         number_of("chi2_reduced", "χ² per datum", ""),
         number_of("degrees_of_freedom", "degrees of freedom for signal", ""),
     ]
+
+
+def _wavelength(value: object) -> str:
+    """A wavelength written in metres, in µm; anything else as it is."""
+    number_of, _, unit = str(value).partition(" ")
+    try:
+        return f"{float(number_of) * 1e6:.6g} µm" if unit == "m" else str(value)
+    except ValueError:
+        return str(value)
 
 
 def _path(dataset: Dataset) -> str:
@@ -461,7 +471,7 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
     for n, (i, j) in enumerate(chosen):
         begin, end = (int(time) for time in bounds(products[i])[j])
         shown.append({
-            "label": f"{interval(begin, end)} UTC",
+            "label": f"{' to '.join(interval(begin, end))} UTC",
             "quality": LEVELS[levels(products[i])[j]],
             "flags": flag_names(int(flags(products[i])[j])),
             "panels": [_markup(panel, f"b{n}{panel.key[:2]}", [products[i]], j) for panel in BATCH_PANELS],
@@ -510,7 +520,9 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
         period=days(start, stop),
         count=len(batches),
         path=list(dict.fromkeys(_path(dataset) for dataset in products)),
-        wavelength=", ".join(dict.fromkeys(str(d.attrs["wavelength"]) for d in products if "wavelength" in d.attrs)),
+        wavelength=", ".join(
+            dict.fromkeys(_wavelength(d.attrs["wavelength"]) for d in products if "wavelength" in d.attrs)
+        ),
         quality=[(i, word, int((level == i).sum())) for i, word in enumerate(LEVELS)],
         flags=[
             (

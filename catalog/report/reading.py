@@ -182,7 +182,7 @@ def maps(dataset: Dataset, batch: int) -> list[Maps]:
 def has_profile(dataset: Dataset) -> NDArray[np.bool_]:
     """Whether each batch has a profile, (time,)."""
     cn2 = values(dataset, "cn2")
-    return np.zeros(dataset.sizes["time"], bool) if cn2 is None else np.isfinite(cn2).any(axis=1)
+    return np.zeros(dataset.sizes["time"], bool) if cn2 is None else np.asarray(np.isfinite(cn2).any(axis=1))
 
 
 @dataclass(frozen=True)

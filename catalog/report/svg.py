@@ -120,10 +120,8 @@ def inline_svg(figure: Figure, prefix: str, label: str, description: str) -> str
     str
         An ``<svg>`` element without style attributes, scripts or references to the outside.
     """
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
     buffer = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     root = ElementTree.fromstring(buffer.getvalue())
     writer = _Writer(prefix, root)
     for child in root:

@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...pipeline.products import QUALITY_FLAGS
 from .reading import (
     DAY,
     LEVELS,
+    Floats,
     Series,
     bounds,
     edges,
@@ -33,6 +35,7 @@ from .words import clock, days, month, number, offset, scientific, site_zone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from xarray import Dataset
 
@@ -72,9 +75,9 @@ def time_axis(ax: Axes, datasets: Sequence[Dataset]) -> Axes:
     ax.set_xlim(low, high)
     width = high - low
 
-    def ticks(axis: object, zone: datetime.tzinfo) -> None:
-        axis.set_major_locator(AutoDateLocator(tz=zone, minticks=3, maxticks=8, interval_multiples=True))  # type: ignore[attr-defined]
-        axis.set_major_formatter(lambda value, _: _tick(value, zone, width))  # type: ignore[attr-defined]
+    def ticks(axis: Axis, zone: datetime.tzinfo) -> None:
+        axis.set_major_locator(AutoDateLocator(tz=zone, minticks=3, maxticks=8))  # type: ignore[no-untyped-call]
+        axis.set_major_formatter(lambda value, _: _tick(value, zone, width))
 
     ticks(ax.xaxis, datetime.UTC)
     ax.set_xlabel(f"UTC, {days(start, stop)}")
@@ -93,9 +96,14 @@ _LEFT, _RIGHT, _LINE = 1.0, 0.45, 0.2
 
 
 def _frame(
-    figure: Figure, datasets: Sequence[Dataset], heights: Sequence[float], *, left: float = _LEFT, right: float = _RIGHT,
+    figure: Figure,
+    datasets: Sequence[Dataset],
+    heights: Sequence[float],
+    *,
+    left: float = _LEFT,
+    right: float = _RIGHT,
     head: float = 0.0,
-) -> list[Axes]:  # fmt: skip
+) -> list[Axes]:
     """Stack axes over a common time axis, from above, with room for the labels that this period needs."""
     start, stop = span(datasets)
     # Ticks of more than a day and less than a week carry the date in a second line.
@@ -171,24 +179,24 @@ def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     ax.set_ylabel("distance from the pupil z (m)")
     time_axis(ax, products)
     if image is not None:
-        bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")  # type: ignore[union-attr]
+        bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
         bar.set_label(r"$C_n^2$ (m$^{-2/3}$)")
         bar.outline.set_linewidth(0.6)
     return ax
 
 
-def _active(dataset: Dataset, cn2: np.ndarray) -> np.ndarray:
+def _active(dataset: Dataset, cn2: Floats) -> NDArray[np.bool_]:
     bound = values(dataset, "cn2_at_bound")
-    return (np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0) & np.isfinite(cn2)
+    return np.asarray((np.nan_to_num(bound) > 0 if bound is not None else cn2 <= 0) & np.isfinite(cn2))
 
 
-def _runs(flag: np.ndarray) -> list[tuple[int, int]]:
+def _runs(flag: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """[start, stop) of each run of true values."""
     turns = np.flatnonzero(np.diff(np.concatenate([[0], flag.astype(np.int8), [0]])))
     return [(int(a), int(b)) for a, b in turns.reshape(-1, 2)]
 
 
-def _uninterrupted(limit: np.ndarray) -> list[tuple[int, int]]:
+def _uninterrupted(limit: Floats) -> list[tuple[int, int]]:
     """[first, last) of each stretch of batches that follow each other within a tenth of a batch."""
     gap = limit[1:, 0] - limit[:-1, 1]
     cuts = np.flatnonzero(np.abs(gap) > 0.1 * np.median(limit[:, 1] - limit[:, 0])) + 1
@@ -229,8 +237,8 @@ def describe_time_distance(datasets: Sequence[Dataset]) -> str:
             i, j = np.unravel_index(np.nanargmax(cn2), cn2.shape)
             border = edges(dataset)
             words = (
-                f"The largest value is {scientific(best)} m^(-2/3), {number(border[j], 4)} to {number(border[j + 1], 4)} m away "
-                f"at {clock(int(bounds(dataset)[i, 0]))} UTC. "
+                f"The largest value is {scientific(best)} m^(-2/3), {number(border[j], 4)} to "
+                f"{number(border[j + 1], 4)} m away at {clock(int(bounds(dataset)[i, 0]))} UTC. "
             )
     return f"{words}Of {total} values {bounded} are at the bound of zero and {blank} are missing."
 
@@ -240,7 +248,7 @@ def _follow(ax: Axes, line: Series | None, label: str, **style: object) -> None:
         if line.values.size > MARKED:
             style["marker"] = ""
         elif line.values.size <= SPANNED:
-            ax.hlines(line.values, line.days - line.half, line.days + line.half, color=style["color"], lw=1.2)  # type: ignore[arg-type]
+            ax.hlines(line.values, line.days - line.half, line.days + line.half, color=style["color"], lw=1.2)
         ax.plot(line.days, line.values, label=label, **style)  # type: ignore[arg-type]
 
 
@@ -320,7 +328,7 @@ def describe_strength(datasets: Sequence[Dataset]) -> str:
     return " ".join(parts) or "No batch has these numbers."
 
 
-def _percent(relative: np.ndarray) -> str:
+def _percent(relative: Floats) -> str:
     middle, spread = float(np.mean(relative)), float(np.std(relative))
     side = "larger" if middle >= 0 else "smaller"
     more = f" on average (standard deviation {number(spread, 2)} %)" if relative.size > 1 else ""
@@ -333,8 +341,8 @@ def draw_chi2(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     line = series(products, "chi2_reduced")
     ax.axhline(1, color=MUTED, lw=1.2)
     ax.axhline(3, color=RED, lw=1.2, ls=(0, (5, 3)))
-    ax.annotate("flagged above 3", (1, 3), xycoords=("axes fraction", "data"), xytext=(-2, 3), textcoords="offset points",
-                ha="right", color=RED, fontsize=11)  # fmt: skip
+    ax.annotate("flagged above 3", (1, 3), xycoords=("axes fraction", "data"), xytext=(-2, 3),
+                textcoords="offset points", ha="right", color=RED, fontsize=11)  # fmt: skip
     _follow(ax, line, "chi2", color=BLUE, marker="o", ls="-", ms=5)
     _from_zero(ax, line)
     ax.set_ylim(top=max(ax.get_ylim()[1], 3.6))

@@ -80,10 +80,10 @@ def clock(time: int, zone: datetime.tzinfo = datetime.UTC) -> str:
     return f"{when:%Y-%m-%d %H:%M:%S}{tenths}"
 
 
-def interval(start: int, stop: int, zone: datetime.tzinfo = datetime.UTC) -> str:
-    """``2012-09-14 12:15:00 to 14:15:00``, with the second date where it is another one."""
+def interval(start: int, stop: int, zone: datetime.tzinfo = datetime.UTC) -> tuple[str, str]:
+    """``2012-09-14 12:15:00`` and ``14:15:00``, the second with its date where that is another one."""
     first, last = clock(start, zone), clock(stop, zone)
-    return f"{first} to {last.removeprefix(first[:11])}"
+    return first, last.removeprefix(first[:11])
 
 
 def day(time: int, zone: datetime.tzinfo = datetime.UTC) -> str:
