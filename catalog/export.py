@@ -42,12 +42,12 @@ def _ordered(datasets: Sequence[xr.Dataset]) -> list[xr.Dataset]:
 
 def _write_whole(target: Path, write: Callable[[Path], object]) -> None:
     """Let a file appear under its name only when it is complete."""
+    if not target.parent.is_dir():
+        raise ExportError(f"{safe(str(target))}: there is no folder to write to")
     temporary = target.parent / temporary_name()
     try:
         write(temporary)
         os.replace(temporary, target)
-    except FileNotFoundError as error:
-        raise ExportError(f"{safe(str(target))}: there is no folder to write to") from error
     finally:
         temporary.unlink(missing_ok=True)
 
