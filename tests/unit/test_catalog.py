@@ -598,17 +598,30 @@ def test_the_tables_are_postgresql_too():
 @pytest.mark.skipif("COSLIDAR_TEST_POSTGRESQL" not in os.environ, reason="COSLIDAR_TEST_POSTGRESQL names no server")
 def test_postgresql(tmp_path):
     url = os.environ["COSLIDAR_TEST_POSTGRESQL"]
-    with sa.create_engine(url).begin() as connection:
-        database.metadata.drop_all(connection)
-    with Catalog(tmp_path, url) as catalog:
-        run = catalog.start_run()
-        made = product()
-        with ThreadPoolExecutor(8) as pool:
-            outcomes = list(pool.map(lambda _: catalog.publish(made, run), range(16)))
-        assert sum(outcome.new for outcome in outcomes) == 1
-        assert catalog.collect(older_than=0) == []
-        assert catalog.batches()[2].r0 is None
-        catalog.finish_run(run)
-        whole(catalog)
-        with catalog.database.write() as connection:
-            database.metadata.drop_all(connection)
+    engine = sa.create_engine(url)
+    with engine.connect() as connection:
+        assert sa.inspect(connection).get_table_names() == [], "this test wants an empty database: it drops its tables"
+    try:
+        with Catalog(tmp_path, url) as catalog:
+            run = catalog.start_run({"note": "\0"}, "x\0\ud800")
+            made = product()
+            with ThreadPoolExecutor(8) as pool:
+                outcomes = list(pool.map(lambda _: catalog.publish(made, run), range(16)))
+            assert sum(outcome.new for outcome in outcomes) == 1
+            assert len({outcome.row for outcome in outcomes}) == 1
+            assert catalog.has(IDENTITY, key())
+            assert catalog.find("2012-09-14T1415") == outcomes[0].row
+            assert catalog.collect(older_than=0) == []
+            assert [row.r0 is None for row in catalog.batches()] == [False, False, True]
+            catalog.record_failure(run, "x", "no light", start=START, stop=START + LENGTH)
+            catalog.finish_run(run)
+            outcomes[0].row.path.unlink()
+            assert catalog.publish(made, run).new
+            whole(catalog)
+            with catalog.database.write() as connection:
+                connection.execute(sa.update(database.schema_version).values(version=99))
+            with pytest.raises(DatabaseError, match="newer"):
+                Catalog(tmp_path, url)
+    finally:
+        database.metadata.drop_all(engine)
+        engine.dispose()
