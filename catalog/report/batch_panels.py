@@ -344,43 +344,67 @@ def describe_correlations(dataset: Dataset, batch: int) -> str:
     return "; ".join(parts) + "." + alone
 
 
-def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
-    """Draw the criterion of a batch against log10(mu) with the chosen value marked."""
+def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0, *, near: float | None = None) -> Axes:
+    """Draw the criterion of a batch against log10(mu) with the chosen value marked.
+
+    Parameters
+    ----------
+    ax : Axes
+        Where to draw.
+    dataset : Dataset
+        A product.
+    batch : int
+        Number of the batch in the product.
+    near : float, optional
+        Show only this many decades of mu on either side of the chosen value, as excess over the minimum.
+
+    Returns
+    -------
+    Axes
+        `ax`.
+    """
     grid = of_batch(dataset, "log_mu_grid", batch)
     curve = of_batch(dataset, "criterion", batch)
     chosen = log_mu(scalar(dataset, "mu", batch))
     ax.set_xlabel(r"$\log_{10}\,\mu$   ($\mu$ in m$^{4/3}$)")
     if grid is None or curve is None or not np.isfinite(curve).any():
-        _note(ax, "no criterion: μ was given")
-        return ax
+        return _note(ax, "no criterion: μ was given")
     finite = np.isfinite(curve)
-    lowest = curve[finite].min()
+    grid, curve = grid[finite], curve[finite]
+    lowest = curve.min()
+    # GCV is positive and only its shape counts; others, as a logarithm of evidence, count by differences.
     ratio = lowest > 0
-    shown = curve / lowest if ratio else curve - lowest
-    ax.plot(grid[finite], shown[finite], "-", color=BLUE, marker=".", ms=6)
-    ax.set_ylabel("criterion / its minimum" if ratio else "criterion − its minimum")
-    if ratio and np.nanmax(shown[finite]) > 20:
-        from matplotlib.ticker import LogFormatter, NullFormatter
-
-        ax.set_yscale("log")
-        ax.yaxis.set_major_formatter(LogFormatter())
-        ax.yaxis.set_minor_formatter(NullFormatter())
+    name = str(dataset.attrs.get("selector", ""))
+    name = name.upper() if name in ("gcv", "upre") else "criterion"
+    if near is not None and np.isfinite(chosen):
+        keep = np.abs(grid - chosen) <= near + 1e-9
+        grid, curve = grid[keep], curve[keep]
+        curve = 100 * (curve / lowest - 1) if ratio else curve - lowest
+        ax.set_ylabel("above the minimum (%)" if ratio else "above the minimum")
+    else:
+        curve = curve / lowest if ratio else curve - lowest
+        ax.set_ylabel(f"{name} / its minimum" if ratio else f"{name} − its minimum")
+    if not grid.size:
+        return _note(ax, "μ is outside the curve")
+    ax.plot(grid, curve, "-", color=BLUE, marker=".", ms=6)
     if np.isfinite(chosen):
         ax.axvline(chosen, color=RED, lw=1.6, ls=(0, (5, 3)))
-        level = np.interp(chosen, grid[finite], shown[finite])
-        ax.plot([chosen], [level], "D", color=RED, mfc=PAPER, ms=8, mew=1.8)
-        right = chosen > (grid[0] + grid[-1]) / 2
-        ax.annotate(
-            f"chosen: {number(chosen, 4)}", (chosen, 0.93), xycoords=("data", "axes fraction"), color=RED,
-            xytext=(-8 if right else 8, 0), textcoords="offset points", ha="right" if right else "left",
-        )  # fmt: skip
+        ax.plot([chosen], [np.interp(chosen, grid, curve)], "D", color=RED, mfc=PAPER, ms=8, mew=1.8)
+        if near is None:
+            right = chosen > (grid[0] + grid[-1]) / 2
+            ax.annotate(
+                f"chosen: {number(chosen, 4)}", (chosen, 0.93), xycoords=("data", "axes fraction"), color=RED,
+                xytext=(-8 if right else 8, 0), textcoords="offset points", ha="right" if right else "left",
+            )  # fmt: skip
+    ax.yaxis.set_major_formatter(_plain)
     ax.grid(axis="y")
     return ax
 
 
 def compose_criterion(figure: Figure, dataset: Dataset, batch: int) -> None:
-    """Lay out the figure of the criterion."""
-    draw_criterion(figure.add_axes((0.105, 0.19, 0.88, 0.77)), dataset, batch)
+    """Lay out the criterion as a whole and near the chosen value."""
+    draw_criterion(figure.add_axes((0.09, 0.19, 0.52, 0.77)), dataset, batch)
+    draw_criterion(figure.add_axes((0.72, 0.19, 0.265, 0.77)), dataset, batch, near=1.5)
 
 
 def describe_criterion(dataset: Dataset, batch: int) -> str:

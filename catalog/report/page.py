@@ -116,10 +116,11 @@ BATCH_PANELS = (
     BatchPanel(
         "correlations",
         "Does the profile explain the measured correlations?",
-        "Each map shows a correlation against the separation of two subapertures, dx to the right and dy upward; "
-        "separations without a pair are blank. Measured and model share a scale for all slope maps, and one for "
-        "both scintillation maps. Residuals are (measured − model) in units of their error: an rms near 1 is a "
-        "good fit, and a plus or minus sign marks more than 3 errors. The last row cuts the maps at dx = 0.",
+        "Each map shows a correlation against the separation of two subapertures, dx to the right and dy "
+        "upward; separations without a pair are blank. Measured and model share a scale for all slope maps, and "
+        "one for both scintillation maps. Residuals are (measured − model) in units of their error, with a plus "
+        "or minus sign beyond 3. Errors of neighbouring entries are correlated, so that whole areas share a "
+        "sign and the rms may lie well below 1; well above 1 it is a misfit. The last row cuts the maps at dx = 0.",
         one.CORRELATION_SIZE,
         one.compose_correlations,
         one.describe_correlations,
@@ -128,7 +129,8 @@ BATCH_PANELS = (
         "criterion",
         "How was the strength of the regularisation chosen?",
         "The curve is the criterion for each μ; μ is the inverse of the a priori variance of the profile. The "
-        "diamond on the dashed line is the value used. A flat curve means that the data hardly tell.",
+        "diamond on the dashed line is the value used; on the right, its surroundings. A flat curve means that "
+        "the data hardly tell.",
         (10.0, 3.6),
         one.compose_criterion,
         one.describe_criterion,
@@ -263,9 +265,9 @@ def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
     means, errors = zip(*(path_mean(dataset, batch) for dataset, batch in batches), strict=True)
     value, remark = _spread(means)
     if len(batches) == 1 and np.isfinite(means[0]):
-        value, remark = measured(means[0], errors[0]), "error: the slices' MAP bars, added as if they were one error"
+        value, remark = measured(means[0], errors[0]), "error: the slices' MAP bars, taken as independent"
     elif np.isfinite(errors).any():
-        remark += f"; error of one batch at most {scientific(float(np.nanmedian(errors)), 2)}"
+        remark += f"; error of one batch {scientific(float(np.nanmedian(errors)), 2)}"
     return [
         {"name": "Cn², mean over the path", "value": value, "unit": "m^(-2/3)", "remark": remark},
         number_of("r0_profile", "Fried parameter r₀, from the profile", "cm", 100),
@@ -286,21 +288,31 @@ def _wavelength(value: object) -> str:
         return str(value)
 
 
+def _settings(products: Sequence[Dataset]) -> str:
+    """The choices that a reader of a profile should know, as far as the products name them."""
+    found = []
+    for name in ("source_model", "spectrum", "sampling", "slope_response", "covariance", "regulariser", "selector"):
+        chosen = dict.fromkeys(str(dataset.attrs[name]) for dataset in products if name in dataset.attrs)
+        if chosen:
+            found.append(f"{name.replace('_', ' ')} {' and '.join(chosen)}")
+    return ", ".join(found)
+
+
 def _path(dataset: Dataset) -> str:
     border = edges(dataset)
     return f"{border.size - 1} slices, {number(border[0], 4)} to {number(border[-1], 4)} m from the pupil"
 
 
 def path_mean(dataset: Dataset, batch: int) -> tuple[float, float]:
-    """Cn2 averaged over the path and the largest error that its MAP bars allow, m^(-2/3); NaN without a profile."""
+    """Cn2 averaged over the path and its error from independent MAP bars, m^(-2/3); NaN without a profile."""
     cn2, error = of_batch(dataset, "cn2", batch), of_batch(dataset, "cn2_standard_error", batch)
     if cn2 is None or not np.isfinite(cn2).all():
         return float("nan"), float("nan")
     width = np.diff(edges(dataset))
     share = width / width.sum()
-    # Errors of neighbouring slices are correlated, mostly negatively, and a product holds no correlation: their plain
-    # sum is the largest that it can be.
-    return float(share @ cn2), float(share @ error) if error is not None else float("nan")
+    # A product holds no correlation of its errors. Those of neighbouring slices are mostly negative, as what one slice
+    # loses the next one gains, so that independence exaggerates rather than flatters.
+    return float(share @ cn2), float(np.sqrt(np.sum((share * error) ** 2))) if error is not None else float("nan")
 
 
 #: Columns of the table of batches: heading, unit, tooltip.
@@ -519,6 +531,7 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
         zone=None if zone is None else f"{zone.key}, {offset(start, zone)}",
         period=days(start, stop),
         count=len(batches),
+        settings=_settings(products),
         path=list(dict.fromkeys(_path(dataset) for dataset in products)),
         wavelength=", ".join(
             dict.fromkeys(_wavelength(d.attrs["wavelength"]) for d in products if "wavelength" in d.attrs)

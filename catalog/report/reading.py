@@ -167,15 +167,11 @@ def maps(dataset: Dataset, batch: int) -> list[Maps]:
         model = of_batch(dataset, f"{prefix}_correlation_model", batch)
         error = of_batch(dataset, f"{prefix}_correlation_error", batch)
         for i, kind in enumerate(kinds):
-            if np.isfinite(measured[i]).any():
-                found.append(
-                    Maps(
-                        kind,
-                        measured[i],
-                        (blank if model is None else model)[i],
-                        (blank if error is None else error)[i],
-                    )
-                )
+            here = np.isfinite(measured[i])
+            if here.any():
+                # A profile has a correlation at every separation; without a pair there is nothing to compare it with.
+                shown = np.where(here, (blank if model is None else model)[i], np.nan)
+                found.append(Maps(kind, measured[i], shown, (blank if error is None else error)[i]))
     return sorted(found, key=lambda item: MAP_KINDS.index(item.kind))
 
 

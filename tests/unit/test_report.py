@@ -307,6 +307,22 @@ def test_dy_points_upward_in_the_maps() -> None:
     assert columns == pytest.approx(0.5, abs=0.05)
 
 
+def test_maps_are_compared_where_there_are_pairs() -> None:
+    from coslidar.catalog.report.reading import maps
+
+    dataset = product(1)
+    dataset["slope_correlation_model"][:] = 1.0
+    item = maps(dataset, 0)[1]
+    assert item.kind == "yy_auto"
+    empty = dataset["pair_count"].values == 0
+    assert empty.sum() == 12
+    for values in (item.measured, item.model, item.residual):
+        np.testing.assert_array_equal(np.isnan(values), empty)
+    expected = (dataset["slope_correlation"] - 1.0) / dataset["slope_correlation_error"]
+    np.testing.assert_allclose(item.residual, expected.values[0, 1])
+    assert item.rms == pytest.approx(np.sqrt(np.nanmean(expected.values[0, 1] ** 2)))
+
+
 def test_gaps_of_the_map_are_blank_and_bounded_values_hatched() -> None:
     from matplotlib.figure import Figure
 
