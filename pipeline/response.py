@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -62,6 +62,8 @@ TOLERANCE = 5e-7
 _NODES_PER_RADIAN = 0.42
 _SHELL_RATIO = math.sqrt(2.0)
 _MAX_SHELLS = 90
+#: Turns of the diffraction fringe within a slice above which its mean is negligible (below 1e-5 of a cross map).
+_FRINGE_TURNS = 20
 _CHUNK = 8192
 
 #: Nested rules of 3, 7 and 15 points: Gauss-Legendre with the extensions of Kronrod and Patterson 1968
@@ -275,8 +277,8 @@ def _radial_power(spectrum: TurbulenceSpectrum) -> float:
 
 def _slice_integral(model: _Model, z0: float, z1: float) -> Array:
     """Integral of W over one slice, (6, 2p - 1, 2q - 1), halving panels until their rules agree."""
-    resolution = _resolution(model, (z0 + z1) / 2)
-    edges = _panel_edges(model, z0, z1)
+    effort = _effort(model, z0, z1)
+    edges = _panel_edges(model, z0, z1, effort)
     # Wide panels first: what is added later needs no accuracy of its own.
     waiting = sorted(itertools.pairwise(edges), key=lambda panel: panel[1] - panel[0])
     done: list[tuple[float, float, Array, Array]] = []
@@ -284,7 +286,7 @@ def _slice_integral(model: _Model, z0: float, z1: float) -> Array:
     for _ in range(64):
         while waiting:
             a, b = waiting.pop()
-            maps, error = _panel(model, a, b, (b - a) / (z1 - z0) * _sizes(total), resolution)
+            maps, error = _panel(model, a, b, (b - a) / (z1 - z0) * _sizes(total), effort)
             done.append((a, b, maps, error))
             total = total + maps
         errors = np.array([error for *_, error in done]) / _sizes(total)
@@ -303,7 +305,7 @@ def _sizes(maps: Array, floor: Array | float = 0.0) -> Array:
     return np.asarray(np.maximum(np.maximum(np.abs(maps).max(axis=(1, 2)), floor), np.finfo(float).tiny))
 
 
-def _panel_edges(model: _Model, z0: float, z1: float) -> list[float]:
+def _panel_edges(model: _Model, z0: float, z1: float, effort: _Effort) -> list[float]:
     """Borders of the panels along z: the slice, cut where the shift m s passes a multiple of d.
 
     There the edges of the two subapertures coincide, and the cross maps have a kink in z, as long as the source
@@ -313,6 +315,8 @@ def _panel_edges(model: _Model, z0: float, z1: float) -> list[float]:
     d = geometry.subaperture_size
     blur = geometry.magnification((z0 + z1) / 2) * max(model.extent)
     pieces = min(4, math.ceil(d / (3 * blur))) if blur else 4
+    if effort.lowest:
+        pieces = max(pieces, math.ceil((_turns_of_fringe(model, z1) - _turns_of_fringe(model, z0)) / 3))
     cuts = set(np.linspace(z0, z1, pieces + 1).tolist())
     for s, n in zip(geometry.separation, (geometry.q, geometry.p), strict=True):
         for step in range(1, n + 1):
@@ -328,30 +332,30 @@ def _panel_edges(model: _Model, z0: float, z1: float) -> list[float]:
     return [z0, *kept[1:], z1]
 
 
-def _panel(model: _Model, z0: float, z1: float, floor: Array, resolution: float) -> tuple[Array, Array]:
+def _panel(model: _Model, z0: float, z1: float, floor: Array, effort: _Effort) -> tuple[Array, Array]:
     """Integral of W over [z0, z1], (6, 2p - 1, 2q - 1), and the error of each kind, (6,)."""
     z = (z0 + z1) / 2 + (z1 - z0) / 2 * _NODES
     rules = (z1 - z0) / 2 * _RULES
-    three, seven, fifteen = _layers(model, z[_FIRST], rules[:, _FIRST], floor, resolution)
+    three, seven, fifteen = _layers(model, z[_FIRST], rules[:, _FIRST], floor, effort)
     first = np.abs(seven - three).max(axis=(1, 2))
     # The difference is the error of the shorter rule; the power 3/2 for that of the longer one is QUADPACK's.
     error = first * np.minimum(1.0, np.sqrt(2e4 * first / _sizes(seven, floor)))
     if np.all(error <= TOLERANCE / 2 * _sizes(seven, floor)):
         return seven, error
-    fifteen = fifteen + _layers(model, z[_SECOND], rules[2:, _SECOND], _sizes(seven, floor), resolution)[0]
+    fifteen = fifteen + _layers(model, z[_SECOND], rules[2:, _SECOND], _sizes(seven, floor), effort)[0]
     last = np.abs(fifteen - seven).max(axis=(1, 2))
     # Diffraction by the edges oscillates in z near the pupil, and gains only a factor of ten there; 1e-9 elsewhere.
     return fifteen, last / 10
 
 
-def _layers(model: _Model, z: Array, rules: Array, floor: Array, resolution: float) -> Array:
+def _layers(model: _Model, z: Array, rules: Array, floor: Array, effort: _Effort) -> Array:
     """Weighted sums of W over layers, (rules, 6, 2p - 1, 2q - 1)."""
     maps = np.zeros((len(rules), 6, *model.geometry.map_shape))
     for first, last in _groups(model.geometry, z):
         # Each run of layers may leave its share of the error that the sum of all of them may.
         share = float(rules[-1, first:last].sum() / rules[-1].sum())
         allowance = share * _sizes(maps[-1], floor)
-        maps += _maps(model, z[first:last], rules[:, first:last], allowance, resolution)
+        maps += _maps(model, z[first:last], rules[:, first:last], allowance, effort)
     return maps
 
 
@@ -371,27 +375,70 @@ def _at(model: _Model, z: float) -> Array:
         # Tilts of a layer at the source move nothing, and it has no way to diffract.
         maps = np.zeros(shape)
     else:
-        maps = _maps(model, np.array([z]), np.ones((1, 1)), np.zeros(6), _resolution(model, z))[0]
+        maps = _maps(model, np.array([z]), np.ones((1, 1)), np.zeros(6), _effort(model, z, z))[0]
     if model.geometry.n_sources == 1:
         maps[list(_CROSS)] = np.nan
     return maps
 
 
-def _resolution(model: _Model, z: float) -> float:
-    """Factor on all orders at which the maps of a layer no longer move when the orders grow by a third."""
-    resolution = 1.0
+@dataclass(frozen=True)
+class _Effort:
+    """How finely and how far the frequencies of a slice are followed.
+
+    A factor on all orders, the frequency below which the cross maps do not stop, and whether they leave out the fringe
+    that diffraction prints at the shift between the sources (see `_effort`).
+    """
+
+    resolution: float = 1.0
+    lowest: float = 0.0
+    without_fringe: bool = False
+
+
+def _fringe_frequency(model: _Model) -> float:
+    """Frequency s / (2 lambda L) at which the phase 2X of any layer is stationary against that of the shift m s."""
+    length = 1.0 if model.geometry.infinite else model.geometry.path_length
+    return math.hypot(*model.geometry.separation) / (2 * model.geometry.wavelength * length)
+
+
+def _turns_of_fringe(model: _Model, z: float) -> float:
+    """Phase of the fringe, in turns: (m s)^2 / (4 lambda z L / (L - z))."""
+    geometry = model.geometry
+    if z == geometry.path_length:
+        return math.inf
+    reach = math.hypot(*geometry.separation) * geometry.magnification(z)
+    return reach**2 / (4 * geometry.wavelength * z * geometry.scaling(z)) if z else 0.0
+
+
+def _effort(model: _Model, z0: float, z1: float) -> _Effort:
+    """Orders with which the maps of a slice no longer move when they grow by a third.
+
+    Sources smaller than the fringe leave about 1e-3 of it in the scintillation cross map, beyond frequencies at which
+    nothing else is left. It is followed there, unless it turns so often within the slice that its mean is gone.
+    """
+    effort = _Effort()
+    frequency = _fringe_frequency(model)
+    if frequency:
+        sx, sy = (frequency * s / math.hypot(*model.geometry.separation) for s in model.geometry.separation)
+        m = model.geometry.magnification(z0)
+        left = max(
+            float(np.abs(source.transfer(np.array([m * sx]), np.array([m * sy])))[0]) for source in model.sources
+        )
+        if left > 3e-4:
+            often = _turns_of_fringe(model, z1) - _turns_of_fringe(model, z0) > _FRINGE_TURNS
+            effort = _Effort(lowest=0.0 if often else 1.4 * frequency, without_fringe=often)
+    z = np.array([(z0 + z1) / 2])
     rule, floor = np.ones((1, 1)), np.zeros(6)
-    maps = _maps(model, np.array([z]), rule, floor, resolution)[0]
+    maps = _maps(model, z, rule, floor, effort)[0]
     for _ in range(6):
-        finer = _maps(model, np.array([z]), rule, floor, 4 / 3 * resolution)[0]
-        size = np.abs(finer).max(axis=(1, 2))
-        if np.all(np.abs(finer - maps).max(axis=(1, 2)) <= TOLERANCE * size):
-            return resolution
-        resolution, maps = 4 / 3 * resolution, finer
-    raise ArithmeticError(f"the response at {z:g} m does not converge: the source or the spectrum is too structured")
+        finer_effort = replace(effort, resolution=4 / 3 * effort.resolution)
+        finer = _maps(model, z, rule, floor, finer_effort)[0]
+        if np.all(np.abs(finer - maps).max(axis=(1, 2)) <= TOLERANCE * _sizes(finer)):
+            return effort
+        effort, maps = finer_effort, finer
+    raise ArithmeticError(f"the response at {z[0]:g} m does not converge: the source or the spectrum is too structured")
 
 
-def _maps(model: _Model, z: Array, rules: Array, floor: Array, resolution: float) -> Array:
+def _maps(model: _Model, z: Array, rules: Array, floor: Array, effort: _Effort) -> Array:
     """Weighted sums over layers of W: (rules, 6, 2p - 1, 2q - 1) for weights (rules, layers)."""
     geometry = model.geometry
     maps = np.zeros((len(rules), 6, *geometry.map_shape))
@@ -402,7 +449,7 @@ def _maps(model: _Model, z: Array, rules: Array, floor: Array, resolution: float
     else:
         passes = [_AUTO, _CROSS]
     for kinds in passes:
-        maps[:, kinds] = _integrate(model, z, rules, kinds, floor[list(kinds)], resolution)
+        maps[:, kinds] = _integrate(model, z, rules, kinds, floor[list(kinds)], effort)
     return maps
 
 
@@ -438,7 +485,7 @@ class _Shell:
     fringes: Array | None
 
 
-def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterator[_Shell]:
+def _shells(model: _Model, z: Array, reach: float, effort: _Effort, crossed: bool) -> Iterator[_Shell]:
     """Shells of frequencies from zero outward.
 
     A Gauss-Legendre panel of n nodes over a phase of 2a is in error by about (a / 2)^(2n) / (2n)!, which 0.42 nodes per
@@ -453,6 +500,8 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
     bend = max(bends)
     swing = 2 * math.pi * reach
     fade = max(2 * swing / min(bends), math.sqrt(300 / min(bends))) if min(bends) else math.inf
+    if crossed and effort.without_fringe:
+        fade = 0.5 * _fringe_frequency(model)
 
     start = min(3 / swing, 1 / math.sqrt(bend) if bend else math.inf)
     edges = [0.0] + [start * 8.0**-level for level in range(4, 0, -1)]
@@ -463,7 +512,7 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
         for a, b in itertools.pairwise(edges):
             turned = swing * (b - a) + (bend * (b * b - a * a) if a < _SHELL_RATIO * fade else 0.0)
             panels = max(1, math.ceil(turned / 60))
-            nodes, rule = _legendre(math.ceil(resolution * (_NODES_PER_RADIAN * turned / panels + 8)))
+            nodes, rule = _legendre(math.ceil(effort.resolution * (_NODES_PER_RADIAN * turned / panels + 8)))
             cuts = np.linspace(a, b, panels + 1) ** (1 / model.power)
             half = np.diff(cuts)[:, None] / 2
             u = (cuts[:-1, None] + half) + half * nodes
@@ -472,7 +521,7 @@ def _shells(model: _Model, z: Array, reach: float, resolution: float) -> Iterato
         f = np.concatenate(radii)
         turn = swing * outer
         span = np.pi / 2 if model.even else np.pi
-        angles = math.ceil(resolution * (turn + 8 * turn ** (1 / 3) + 16) * span / (2 * np.pi))
+        angles = math.ceil(effort.resolution * (turn + 8 * turn ** (1 / 3) + 16) * span / (2 * np.pi))
         angle = span * (np.arange(angles) + 0.5) / angles
         fringes = _fall((f / fade - 1) / (_SHELL_RATIO - 1)) if outer > fade else None
         yield _Shell(f, np.concatenate(weights), angle, _fall((f - inner) / (outer - inner)), fringes)
@@ -485,12 +534,12 @@ def _fall(x: Array) -> Array:
     return np.asarray(1 - x**4 * (35 - 84 * x + 70 * x**2 - 20 * x**3))
 
 
-def _integrate(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], floor: Array, resolution: float) -> Array:
+def _integrate(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], floor: Array, effort: _Effort) -> Array:
     """Maps of the given kinds, (rules, kinds, 2p - 1, 2q - 1), adding shells until they stand still."""
     crossed = kinds[-1] in _CROSS
     total: Array | float = 0.0
     before = change = estimate = None
-    for shell in _shells(model, z, _reach(model, z, crossed), resolution):
+    for shell in _shells(model, z, _reach(model, z, crossed), effort, crossed):
         whole, tapered = _shell_maps(model, z, rules, kinds, shell)
         ended = total + tapered
         total = total + whole
@@ -505,7 +554,8 @@ def _integrate(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], fl
                 # The rest is known to a third or better, so it may be twice what it may leave.
                 allowed = 2 * TOLERANCE * np.maximum(largest, floor)
                 moved = np.abs(latest[-1] - estimate[-1]).max(axis=(1, 2))
-                if np.all(moved <= allowed) and np.all(np.abs(rest[-1]).max(axis=(1, 2)) <= allowed):
+                followed = not crossed or shell.f[-1] >= effort.lowest
+                if followed and np.all(moved <= allowed) and np.all(np.abs(rest[-1]).max(axis=(1, 2)) <= allowed):
                     return latest
             change, estimate = step, latest
         before = ended
