@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections import OrderedDict
 from contextlib import contextmanager
@@ -149,7 +150,6 @@ def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
 def _settings() -> dict[str, Any]:
     return {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
-        "distributed.logging.distributed": "error",
         "distributed.admin.tick.limit": "60s",
         "distributed.worker.memory.terminate": 0.95,
     }
@@ -176,12 +176,20 @@ def connect(run: RunParameters) -> Iterator[Client]:
     import dask
     from distributed import Client
 
+    # Prefect gives every logger a handler; what went wrong in a batch is told once, by the driver.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
     threads = run.threads or len(os.sched_getaffinity(0))
     with dask.config.set(_settings()):
         if run.scheduler is None:
             client = Client(
-                processes=False, n_workers=1, threads_per_worker=threads, dashboard_address=None, memory_limit=0
+                processes=False,
+                n_workers=1,
+                threads_per_worker=threads,
+                memory_limit=0,
+                # Nothing of ours listens beyond this machine, not even a page without figures.
+                dashboard_address="127.0.0.1:0",
+                worker_dashboard_address="127.0.0.1:0",
             )
         else:
             address: dict[str, Any] = (

@@ -38,6 +38,7 @@ class Lines:
     def __init__(self, total: int) -> None:
         self.total = total
         self.done = 0
+        self._told: set[str] = set()
         self._lock = Lock()
 
     def planned(self, archive: str, batches: int) -> None:
@@ -46,7 +47,12 @@ class Lines:
     def advanced(self, archive: str, index: int, reason: str) -> None:
         """Say why a batch failed."""
         if reason:
-            click.echo(f"coslidar: {archive}: batch {index} failed: {reason}", err=True)
+            self._say(f"{archive}: batch {index}: {reason}")
+
+    def _say(self, fault: str) -> None:
+        if fault not in self._told:
+            self._told.add(fault)
+            click.echo(f"coslidar: {fault}", err=True)
 
     def finished(self, outcome: ArchiveOutcome) -> None:
         """Say what became of an archive."""
@@ -55,7 +61,7 @@ class Lines:
             click.echo(f"coslidar: [{self.done}/{self.total}] {outcome.name}: {_sentence(outcome)}", err=True)
             if outcome.status in ("refused", "failed"):
                 for fault in outcome.faults:
-                    click.echo(f"coslidar: {fault}", err=True)
+                    self._say(fault)
 
 
 class Bar(Lines):

@@ -131,6 +131,7 @@ def measure(
     count = 0
     layout: extraction.SpotLayout | None = None
     parts: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
+    pixel_noise: list[float] = []
 
     def begin() -> extraction.SpotLayout:
         head = np.concatenate(waiting)
@@ -140,6 +141,7 @@ def measure(
         except ValueError as error:
             raise BatchError(str(error)) from error
         parts.append(extraction.extract(head, found, calibration, parameters))
+        pixel_noise.append(noise.pixel_noise_variance(head[: parameters.reference_frames], found, calibration))
         return found
 
     for block in blocks:
@@ -154,9 +156,14 @@ def measure(
     if layout is None:
         if not waiting:
             raise BatchError("there is no frame")
-        begin()
+        layout = begin()
     slopes, flux, flag = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return Measurements(time, slopes, flux, flag)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a spot that is never measured has no mean
+        mean = np.nanmean(flux, axis=0)
+    height, width = layout.window
+    detection = noise.flux_noise_variance(mean, pixel_noise[0], height * width, header.instrument.gain)
+    return Measurements(time, slopes, flux, flag, detection)
 
 
 def reduce(
@@ -210,9 +217,7 @@ def reduce(
     else:
         covariance = convergence.independent(found.covariance, frames, geometry, found.valid_fraction)
         n_effective = np.full(3, float(frames))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        detection = np.nanmean(noise.white_noise_variance(flux) / found.mean_flux**2, axis=1)
+    detection = (measurements.flux_noise / found.mean_flux**2).mean(axis=1)
 
     period = round(1e9 / frame_rate)
     steps = np.diff(measurements.time)
@@ -274,6 +279,8 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
             rows=geometry.independent,
             noise_bias=model.inversion.noise_bias == "joint",
             slope_offset=model.inversion.slope_offset == "joint",
+            # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
+            seed=reduced.start // 1_000_000 % 2**31,
         )
     except (ValueError, np.linalg.LinAlgError) as error:
         raise BatchError(f"the inversion failed: {error}") from error
@@ -295,6 +302,8 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
         "cn2": profile.cn2,
         "cn2_standard_error": profile.error_map,
         "cn2_standard_error_ml": profile.error_ml,
+        "cn2_interval_68": profile.interval_68,
+        "cn2_interval_95": profile.interval_95,
         "cn2_at_bound": profile.at_bound,
         "averaging_kernel": profile.averaging_kernel,
         "degrees_of_freedom": profile.degrees_of_freedom,

@@ -1,47 +1,76 @@
-"""Detection noise judged from the data alone."""
+"""Detection noise of the fluxes, from pixels without light."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import fft
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-#: Bands into which the upper half of the temporal spectrum is cut; the emptiest is taken for noise.
-_BANDS = 8
+    from .extraction import Calibration, SpotLayout
+
+#: Part of the pixels of the lenslet boxes, those with the least light, that are taken to be dark.
+DARK_PART = 0.25
 
 
-def white_noise_variance(series: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
-    """Variance of the white part of each series, from the floor of its temporal spectrum.
+def pixel_noise_variance(frames: NDArray[Any], layout: SpotLayout, calibration: Calibration) -> float:
+    """Variance of a pixel without light: read noise, and photon noise of the background.
 
-    Turbulence is carried past an aperture by the wind and leaves the fast end of the spectrum nearly empty,
-    detection noise fills all of it alike. The upper half of the spectrum is cut into bands and the mean power of
-    the emptiest one, so that a line of vibration does no harm, is taken for the level of the noise. What
-    turbulence is left in that band makes this an upper bound.
+    Half the mean squared difference of consecutive frames, so that drifts do not count; the median over the darkest
+    quarter of the good pixels in the lenslet boxes, so that neither the wings of a spot nor a flickering pixel do.
 
     Parameters
     ----------
-    series : ndarray, (T, ...)
-        Equally spaced samples; NaN are replaced by the mean of the series.
+    frames : ndarray, (T, row, col)
+        Consecutive raw frames, at least two.
+    layout : SpotLayout
+        Lenslet boxes.
+    calibration : Calibration
+        Dark and bad pixels.
 
     Returns
     -------
-    ndarray of float64, (...)
-        Variance in the squared unit of the series; NaN where a series has fewer than 64 samples.
+    float
+        counts^2; 0 where there are fewer than two frames or no good pixel.
     """
-    if len(series) < 64:
-        return np.full(series.shape[1:], np.nan)
-    values = np.asarray(series, dtype=np.float32)
-    mean = np.nanmean(values, axis=0)
-    deviation = np.where(np.isnan(values), 0, values - mean)
-    length = int(fft.prev_fast_len(len(deviation)))
-    spectrum = fft.rfft(deviation[:length], axis=0)
-    half = spectrum[len(spectrum) // 2 : -1]
-    edges = np.linspace(0, len(half), _BANDS + 1).astype(int)
-    power = np.stack([(np.abs(half[a:b]) ** 2).mean(axis=0) for a, b in zip(edges[:-1], edges[1:], strict=True)])
-    present = 1 - np.isnan(values).mean(axis=0)
-    # Parseval: white noise of variance s^2 has E|X_k|^2 = n s^2 at every frequency.
-    return np.asarray(power.min(axis=0) / (length * present), dtype=np.float64)
+    if len(frames) < 2:
+        return 0.0
+    rows, cols = layout.pitch
+    row = layout.boxes[:, 0, None, None] + np.arange(rows)[:, None]
+    col = layout.boxes[:, 1, None, None] + np.arange(cols)
+    values = frames[:, row, col].astype(np.float64)
+    mean = values.mean(axis=0)
+    if calibration.dark is not None:
+        mean = mean - calibration.dark[row, col]
+    good = np.ones_like(mean, dtype=bool) if calibration.bad_pixel is None else ~calibration.bad_pixel[row, col]
+    if not good.any():
+        return 0.0
+    dark = good & (mean <= np.quantile(mean[good], DARK_PART))
+    return float(np.median((np.diff(values[:, dark], axis=0) ** 2).mean(axis=0) / 2))
+
+
+def flux_noise_variance(
+    flux: NDArray[np.float64], pixel_variance: float, area: float, gain: float | None
+) -> NDArray[np.float64]:
+    """Variance of a flux by detection noise.
+
+    Parameters
+    ----------
+    flux : ndarray
+        Mean flux, counts.
+    pixel_variance : float
+        From :func:`pixel_noise_variance`, counts^2.
+    area : float
+        Pixels of the window.
+    gain : float or None
+        Electrons per count; without it the photon noise of the source itself is left out.
+
+    Returns
+    -------
+    ndarray
+        counts^2: the noise of `area` pixels, and one electron^2 per electron of light.
+    """
+    photons = np.maximum(flux, 0.0) / gain if gain else 0.0
+    return np.asarray(area * pixel_variance + photons)

@@ -22,22 +22,15 @@ class Measurements:
         Background-subtracted sum, counts; NaN where there is none.
     flag : ndarray of uint8, (T, S, A)
         Bits of :data:`coslidar.pipeline.extraction.FLAGS`.
+    flux_noise : ndarray of float64, (S, A)
+        Variance of a flux by detection noise, counts^2.
     """
 
     time: NDArray[np.int64]
     slopes: NDArray[np.float64]
     flux: NDArray[np.float64]
     flag: NDArray[np.uint8]
-
-    @staticmethod
-    def join(parts: list[Measurements]) -> Measurements:
-        """Put consecutive pieces together in time."""
-        return Measurements(
-            np.concatenate([part.time for part in parts]),
-            np.concatenate([part.slopes for part in parts]),
-            np.concatenate([part.flux for part in parts]),
-            np.concatenate([part.flag for part in parts]),
-        )
+    flux_noise: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -93,6 +86,8 @@ SCHEMA = _schema(
     ("cn2", "time z", "m^(-2/3)", "float64", "refractive index structure parameter Cn2"),
     ("cn2_standard_error", "time z", "m^(-2/3)", "float64", "MAP error bar of Cn2"),
     ("cn2_standard_error_ml", "time z", "m^(-2/3)", "float64", "maximum-likelihood error bar of Cn2"),
+    ("cn2_interval_68", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 68 %"),
+    ("cn2_interval_95", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 95 %"),
     ("cn2_at_bound", "time z", "1", "uint8", "1 where the positivity constraint is active"),
     ("averaging_kernel", "time z z_true", "1", "float64", "response of the retrieved to the true profile"),
     ("degrees_of_freedom", "time", "1", "float64", "degrees of freedom for signal"),
