@@ -86,14 +86,17 @@ def recording(n_frames: int) -> tuple[Header, NDArray[np.uint16], Calibration]:
     return header, frames.round().astype(np.uint16), calibration
 
 
-def center_of_mass(frames: NDArray[np.uint16], found: SpotLayout, passes: int) -> NDArray[np.float64]:
+def center_of_mass(
+    frames: NDArray[np.uint16], calibration: Calibration, found: SpotLayout, passes: int
+) -> NDArray[np.float64]:
     """The same work with scipy: three windows per spot, each around the centre of mass of the last."""
     half_y, half_x = (int(side) // 2 for side in found.window)
     rows, cols = found.pitch
     positions = np.empty((len(frames), 2, *found.flux.shape))
-    for t, frame in enumerate(frames):
+    for t, raw in enumerate(frames):
+        frame = np.where(calibration.bad_pixel, 0.0, (raw - calibration.dark) / calibration.flat)
         for a, (r, c) in enumerate(found.boxes):
-            box = frame[r : r + rows, c : c + cols] * found.scale[a] - found.offset[a]
+            box = frame[r : r + rows, c : c + cols]
             for s in range(len(found.spots)):
                 top, bottom, left, right = found.search[s, a]
                 row, col = ndimage.maximum_position(box[top : bottom + 1, left : right + 1])
@@ -124,13 +127,13 @@ def measure(n_frames: int, repeats: int) -> Result:
     found = layout(header, reference_image(frames), calibration, parameters)
     slopes, _, _ = extract(frames, found, calibration, parameters)  # compiles
     few = frames[: max(1, min(len(frames), 8))]
-    reference = center_of_mass(few, found, parameters.passes)
+    reference = center_of_mass(few, calibration, found, parameters.passes)
     own = slopes[: len(few)] / found.pixel_scale + np.moveaxis(found.spots, -1, 0)[::-1]
     # Whole-pixel borders and unfilled bad pixels on their side: half a pixel at worst.
     if not float(np.median(np.abs(own - reference))) < 0.1:
         raise RuntimeError("the two implementations do not measure the same spots")
     kernel, total = fastest(repeats, lambda: extract(frames, found, calibration, parameters), frames.sum)
-    (slow,) = fastest(2, lambda: center_of_mass(few, found, parameters.passes))
+    (slow,) = fastest(2, lambda: center_of_mass(few, calibration, found, parameters.passes))
     return Result(kernel / len(frames), total / len(frames), slow / len(few))
 
 

@@ -62,11 +62,8 @@ BAD_LIGHT = 0.3
 ALONG = 0.9
 #: Across, and for a single source, size of the window in units of the spot's full width at half maximum.
 ACROSS = 6.6
-#: Pixels around a bad one that predict it, on each side.
-NEIGHBOURS = 2
-
-#: Frames that are gone through box by box. Speed only: every frame is measured on its own.
-BLOCK = 16
+#: Pixels (rows, columns away) that predict a bad one.
+NEIGHBOURS = tuple((y, x) for y in range(-2, 3) for x in range(-2, 3) if 0 < y * y + x * x <= 4)
 
 _NUMPY_TYPES = (np.uint8, np.uint16, np.int16, np.float32)
 
@@ -123,13 +120,18 @@ class SpotLayout:
         Position of the source's spot in `template`.
     search : ndarray of int, (S, A, 4)
         First row, last row, first column, last column among which the brightest pixel is looked for.
-    scale, offset : ndarray of float32, (A, rows, cols)
-        Calibrated pixel = raw * scale - offset; both 0 on bad pixels.
+    bands : ndarray of int, (n, 4)
+        Rows of lenslets with a box: first row and first column of the detector, width, first box.
+    scale, offset : ndarray of float32, (n, rows, columns)
+        Calibrated pixel = raw * scale - offset for each band, from its first box to its last; both 0 on bad pixels
+        and between boxes.
+    suspect : ndarray of float32, (A,)
+        Calibrated value from which on a pixel of the box may be saturated.
     bad_start : ndarray of int, (A + 1,)
         The bad pixels of box a are `bad_index[bad_start[a]:bad_start[a + 1]]`.
     bad_index : ndarray of int, (B,)
         Pixel of the box, row * cols + col.
-    bad_neighbour, bad_weight : ndarray, (B, 24)
+    bad_neighbour, bad_weight : ndarray, (B, 12)
         Pixels that predict it, and their weights.
     excluded : ndarray of uint8, (S, A)
         Bits of `FLAGS` that hold for every frame.
@@ -146,8 +148,10 @@ class SpotLayout:
     template: Floats
     centre: Floats
     search: NDArray[np.int64]
+    bands: NDArray[np.int64]
     scale: NDArray[np.float32]
     offset: NDArray[np.float32]
+    suspect: NDArray[np.float32]
     bad_start: NDArray[np.int64]
     bad_index: NDArray[np.int64]
     bad_neighbour: NDArray[np.int64]
@@ -224,6 +228,7 @@ def layout(
     window = _window(parameters, nominal, (rows, cols), fwhm)
     spots = np.repeat(nominal[:, None, :], len(boxes), axis=1)
     start, index, neighbour, weight = _no_bad_pixels(len(boxes))
+    bands, band_scale, band_offset = _bands(boxes, scale, offset)
     first = SpotLayout(
         boxes=boxes,
         pitch=(rows, cols),
@@ -236,8 +241,10 @@ def layout(
         template=np.repeat(typical[None], len(nominal), axis=0),
         centre=nominal,
         search=_search_region(spots, (rows, cols), parameters.search),
-        scale=scale,
-        offset=offset,
+        bands=bands,
+        scale=band_scale,
+        offset=band_offset,
+        suspect=_lowest_saturated(scale, offset, calibration.saturation),
         bad_start=start,
         bad_index=index,
         bad_neighbour=neighbour,
@@ -318,20 +325,31 @@ def extract(
     flux = np.empty((len(frames), n_sources, n_boxes))
     flag = np.empty((len(frames), n_sources, n_boxes), dtype=np.uint8)
     columns = layout.pitch[1]
+    length = layout.scale.shape[-1]
     tall, wide = (int(side) for side in layout.window)
-    saturation = np.inf if calibration.saturation is None else float(calibration.saturation)
-    _kernel(columns, _eights(int(2 * parameters.search) + 1), tall, _eights(wide + 2))(
+    first_box = np.append(layout.bands[:, 3], n_boxes)
+    column = layout.boxes[:, 1] - np.repeat(layout.bands[:, 1], np.diff(first_box))
+    # Pixels of a box, counted in its band.
+    behind = np.repeat(column, np.diff(layout.bad_start))
+    bad_index = layout.bad_index // columns * length + layout.bad_index % columns + behind
+    bad_neighbour = layout.bad_neighbour // columns * length + layout.bad_neighbour % columns + behind[:, None]
+    _kernel(_eights(int(2 * parameters.search)), tall, _eights(wide + 2))(
         frames.reshape(-1),
         len(frames),
         layout.frame_shape[0] * layout.frame_shape[1],
         layout.frame_shape[1],
-        layout.boxes[:, 0] * layout.frame_shape[1] + layout.boxes[:, 1],
+        layout.bands[:, 0] * layout.frame_shape[1] + layout.bands[:, 1],
+        layout.bands[:, 2],
+        columns,
+        length,
+        first_box,
+        column,
         layout.pitch[0],
         layout.scale.reshape(-1),
         layout.offset.reshape(-1),
         layout.bad_start,
-        layout.bad_index,
-        layout.bad_neighbour,
+        bad_index,
+        bad_neighbour,
         layout.bad_weight,
         layout.spots,
         layout.search,
@@ -340,8 +358,8 @@ def extract(
         np.maximum(FLUX_FLOOR * layout.flux, 0.0),
         _half_way(layout.spots),
         layout.excluded,
-        _lowest_saturated(layout, saturation),
-        saturation,
+        layout.suspect,
+        np.inf if calibration.saturation is None else float(calibration.saturation),
         layout.pixel_scale,
         slopes,
         flux,
@@ -526,7 +544,7 @@ def _window(
 def _search_region(spots: Floats, pitch: tuple[int, int], search: float) -> NDArray[np.int64]:
     """First and last row and column to look for the maximum of each spot, (S, A, 4)."""
     low = np.ceil(spots - search)
-    high = np.floor(spots + search)
+    high = low + np.floor(2 * search) - 1
     if len(spots) == 2:
         # Never look beyond half way to the other source.
         apart = np.abs(spots[1] - spots[0])
@@ -562,8 +580,10 @@ def _bare(layout: SpotLayout, spots: Floats, search: float) -> SpotLayout:
         spots=spots,
         flux=np.zeros((n_sources, n_boxes)),
         search=_search_region(spots, layout.pitch, search),
+        bands=np.stack([np.array([rows * box, 0, cols, box]) for box in range(n_boxes)]),
         scale=np.ones((n_boxes, rows, cols), dtype=np.float32),
         offset=np.zeros((n_boxes, rows, cols), dtype=np.float32),
+        suspect=np.full(n_boxes, np.inf, dtype=np.float32),
         bad_start=start,
         bad_index=index,
         bad_neighbour=neighbour,
@@ -618,7 +638,7 @@ def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDA
 def _no_bad_pixels(
     n_boxes: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    count = (2 * NEIGHBOURS + 1) ** 2 - 1
+    count = len(NEIGHBOURS)
     return (
         np.zeros(n_boxes + 1, dtype=np.int64),
         np.zeros(0, dtype=np.int64),
@@ -640,15 +660,9 @@ def _predictors(
     start = np.concatenate([[0], np.cumsum(bad.reshape(n_boxes, -1).sum(axis=1))]).astype(np.int64)
     if start[-1] == 0:
         return _no_bad_pixels(n_boxes)
-    around = [
-        (dy, dx)
-        for dy in range(-NEIGHBOURS, NEIGHBOURS + 1)
-        for dx in range(-NEIGHBOURS, NEIGHBOURS + 1)
-        if (dy, dx) != (0, 0)
-    ]
     index = np.zeros(start[-1], dtype=np.int64)
-    neighbour = np.zeros((start[-1], len(around)), dtype=np.int64)
-    weight = np.zeros((start[-1], len(around)), dtype=np.float32)
+    neighbour = np.zeros((start[-1], len(NEIGHBOURS)), dtype=np.int64)
+    weight = np.zeros((start[-1], len(NEIGHBOURS)), dtype=np.float32)
     splines = [ndimage.spline_filter(image, order=3, mode="nearest") for image in template]
     steps = np.linspace(-1.5, 1.5, 13)
     shift = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -657,10 +671,10 @@ def _predictors(
         index[number] = row * cols + col
         usable = [
             slot
-            for slot, (dy, dx) in enumerate(around)
+            for slot, (dy, dx) in enumerate(NEIGHBOURS)
             if 0 <= row + dy < rows and 0 <= col + dx < cols and not bad[box, row + dy, col + dx]
         ]
-        pixels = np.array([(row, col), *((row + around[slot][0], col + around[slot][1]) for slot in usable)])
+        pixels = np.array([(row, col), *((row + NEIGHBOURS[slot][0], col + NEIGHBOURS[slot][1]) for slot in usable)])
         neighbour[number, : len(usable)] = pixels[1:, 0] * cols + pixels[1:, 1]
         normal = np.zeros((len(usable), len(usable)))
         right = np.zeros(len(usable))
@@ -706,28 +720,45 @@ def _half_way(spots: Floats) -> Floats:
     return vectors
 
 
-def _lowest_saturated(layout: SpotLayout, saturation: float) -> NDArray[np.float32]:
+def _lowest_saturated(
+    scale: NDArray[np.float32], offset: NDArray[np.float32], saturation: float | None
+) -> NDArray[np.float32]:
     """Lowest calibrated value that a saturated pixel of each box can have, (A,)."""
-    if math.isinf(saturation):
-        return np.full(len(layout.boxes), np.inf, dtype=np.float32)
-    level = np.where(layout.scale > 0, saturation * layout.scale - layout.offset, np.inf)
+    if saturation is None:
+        return np.full(len(scale), np.inf, dtype=np.float32)
+    level = np.where(scale > 0, saturation * scale - offset, np.inf)
     lowest: NDArray[np.float32] = level.min(axis=(1, 2)).astype(np.float32)
     # Rounding of the calibrated value must not hide a saturated pixel.
     lowest -= np.abs(lowest) * np.float32(1e-5)
     return lowest
 
 
+def _bands(
+    boxes: NDArray[np.int64], scale: NDArray[np.float32], offset: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Rows of lenslets, and scale and offset of the detector rows that they share."""
+    rows, first = np.unique(boxes[:, 0], return_index=True)
+    last = np.append(first[1:], len(boxes)) - 1
+    left, width = boxes[first, 1], boxes[last, 1] - boxes[first, 1] + scale.shape[2]
+    bands = np.stack([rows, left, width, first], axis=1).astype(np.int64)
+    joined = np.zeros((2, len(rows), scale.shape[1], width.max()), dtype=np.float32)
+    for box, (row, column) in enumerate(boxes):
+        band = int(np.searchsorted(rows, row))
+        columns = slice(column - left[band], column - left[band] + scale.shape[2])
+        joined[0, band, :, columns] = scale[box]
+        joined[1, band, :, columns] = offset[box]
+    return bands, joined[0], joined[1]
+
+
 # --- the kernel ---------------------------------------------------------------------------------------------
 
 
 @lru_cache(maxsize=64)
-def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., None]:
-    """Compiled measurement for one shape of box, search and window.
+def _kernel(lanes: int, tall: int, wide: int) -> Callable[..., None]:
+    """Compiled measurement for one size of search and window.
 
     Parameters
     ----------
-    columns : int
-        Width of a box.
     lanes : int
         Width of the search, rounded up to a multiple of 8.
     tall : int
@@ -739,6 +770,7 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
     -----
     These widths are constants of the compiled code: only then are the inner loops unrolled and turned into vector
     instructions. Index arithmetic is unsigned because a signed index is first tested for counting from the end.
+    A row of lenslets is calibrated at once: detector rows are then read from end to end, which memory likes best.
     """
     # No nnan and no ninf: a pixel that is not a number must reach the tests below.
     relaxed = {"reassoc", "contract", "nsz", "arcp"}
@@ -754,6 +786,11 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
         frame_size: Any,
         frame_columns: Any,
         first_pixel: Any,
+        width: Any,
+        columns: Any,
+        length: Any,
+        first_box: Any,
+        column_of: Any,
         rows: Any,
         scale: Any,
         offset: Any,
@@ -778,8 +815,8 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
         n_sources = spots.shape[0]
         half_y = half * window[0]
         half_x = half * window[1]
-        # Rows and columns beyond the box are read with weight 0.
-        box = np.zeros((rows + 2) * columns + wide + lanes, dtype=np.float32)
+        # A window's last rows and columns may lie beyond the box: there they have no weight.
+        band = np.zeros((rows + 2) * length + wide + lanes, dtype=np.float32)
         peak = np.zeros(lanes, dtype=np.float32)
         at_y = np.zeros(n_sources, dtype=np.float32)
         at_x = np.zeros(n_sources, dtype=np.float32)
@@ -788,41 +825,40 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
         light_of = np.zeros(n_sources, dtype=np.float32)
         brightest = np.zeros(n_sources, dtype=np.float32)
         states = np.zeros(n_sources, dtype=np.uint8)
-        # Box by box through a block of frames: scale and offset of the box then stay in the nearest cache.
-        for begin in range(0, n_frames, BLOCK):
-            for a in range(first_pixel.size):
-                for frame in range(begin, min(begin + BLOCK, n_frames)):
-                    # Calibrate the box once for both sources.
-                    start_of_box = index(frame) * index(frame_size) + index(first_pixel[a])
-                    i = start_of_box
-                    j = index(a) * index(rows * columns)
-                    o = index(0)
-                    for _ in range(rows):
-                        for k in range(index(columns)):
-                            box[o + k] = single(frames[i + k]) * scale[j + k] - offset[j + k]
-                        i += index(frame_columns)
-                        j += index(columns)
-                        o += index(columns)
+        for frame in range(n_frames):
+            for n in range(first_pixel.size):
+                start_of_band = index(frame) * index(frame_size) + index(first_pixel[n])
+                i = start_of_band
+                j = index(n) * index(rows * length)
+                o = index(0)
+                for _ in range(rows):
+                    for k in range(index(width[n])):
+                        band[o + k] = single(frames[i + k]) * scale[j + k] - offset[j + k]
+                    i += index(frame_columns)
+                    j += index(length)
+                    o += index(length)
+                for a in range(first_box[n], first_box[n + 1]):
+                    corner = index(column_of[a])
                     for b in range(bad_start[a], bad_start[a + 1]):
-                        box[bad_index[b]] = none
+                        band[bad_index[b]] = none
                     for b in range(bad_start[a], bad_start[a + 1]):
                         value = none
                         for m in range(bad_neighbour.shape[1]):
-                            value += bad_weight[b, m] * box[bad_neighbour[b, m]]
-                        box[bad_index[b]] = value
+                            value += bad_weight[b, m] * band[bad_neighbour[b, m]]
+                        band[bad_index[b]] = value
                     for s in range(n_sources):
                         # Brightest pixel: largest of each column, then the column, then its row.
                         top = search[s, a, 0]
                         bottom = search[s, a, 1]
                         left = search[s, a, 2]
                         right = search[s, a, 3]
-                        o = index(top * columns + left)
+                        o = corner + index(top * length + left)
                         for k in range(index(lanes)):
-                            peak[k] = box[o + k]
+                            peak[k] = band[o + k]
                         for _ in range(top, bottom):
-                            o += index(columns)
+                            o += index(length)
                             for k in range(index(lanes)):
-                                value = box[o + k]
+                                value = band[o + k]
                                 known = peak[k]
                                 peak[k] = value if value > known else known
                         best = peak[0]
@@ -832,10 +868,10 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
                             best = peak[k] if larger else best
                             column = long(k) if larger else column
                         row = long(top)
-                        o = index(top * columns + left + column)
+                        o = corner + index(top * length + left + column)
                         for r in range(top, bottom + 1):
-                            row = long(r) if box[o] == best else row
-                            o += index(columns)
+                            row = long(r) if band[o] == best else row
+                            o += index(length)
                         at_y[s] = single(row)
                         at_x[s] = single(left + column)
                         light_of[s] = none
@@ -855,29 +891,29 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
                                 states[s] |= window_left
                                 continue
                             row = long(up)
-                            column = long(start)
+                            column = min(long(start), long(max(columns - wide, 0)))
                             down -= single(row)
                             start -= single(column)
                             stop -= single(column)
                             first = one - (up - single(row))
                             last = min(down - single(tall), one)
                             after = max(down - single(tall + 1), none)
-                            o = index(row * columns + column)
-                            end = o + index(tall * columns)
+                            o = corner + index(row * length + column)
+                            end = o + index(tall * length)
                             light = none
                             moment_x = none
                             moment_y = none
                             for k in range(index(wide)):
-                                total = first * box[o + k]
+                                total = first * band[o + k]
                                 moment = none
                                 for r in range(index(1), index(tall)):
-                                    value = box[o + r * index(columns) + k]
+                                    value = band[o + r * index(length) + k]
                                     total += value
                                     moment += single(np.int32(r)) * value
-                                value = last * box[end + k]
+                                value = last * band[end + k]
                                 total += value
                                 moment += single(tall) * value
-                                value = after * box[end + index(columns) + k]
+                                value = after * band[end + index(length) + k]
                                 total += value
                                 moment += single(tall + 1) * value
                                 at = single(np.int32(k))
@@ -916,8 +952,8 @@ def _kernel(columns: int, lanes: int, tall: int, wide: int) -> Callable[..., Non
                             for r in range(low_y, min(low_y + long(tall + 2), long(rows))):
                                 for k in range(low_x, min(low_x + long(wide), long(columns))):
                                     inside = abs(single(r) - last_y[s]) < half_y and abs(single(k) - last_x[s]) < half_x
-                                    used = scale[index((a * rows + r) * columns + k)] != none
-                                    raw = frames[start_of_box + index(r * frame_columns + k)]
+                                    used = scale[index((n * rows + r) * length + k) + corner] != none
+                                    raw = frames[start_of_band + corner + index(r * frame_columns + k)]
                                     if inside and used and raw >= saturation:
                                         state |= saturated
                         flag[frame, s, a] = state
