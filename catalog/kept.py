@@ -56,7 +56,7 @@ class Kept:
         """
         target = self.path(key)
         packed = io.BytesIO()
-        np.savez(packed, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez(packed, allow_pickle=False, **arrays)
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.parent / temporary_name()
         try:

@@ -216,8 +216,8 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
             f"for example {sample}"
         )
     # The root factor of the unit alone: multiplying quantities would drag fractional exponents through pint.
-    factor = registry.get_root_units(found)[0] / registry.get_root_units(wanted)[0]
-    return rounded(number * float(factor))
+    ours, theirs = (float(str(registry.get_root_units(each)[0])) for each in (found, wanted))
+    return rounded(number * (ours / theirs))
 
 
 #: Stands for the key in a reason that is kept until the whole location of the value is known.
