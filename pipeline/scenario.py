@@ -87,8 +87,8 @@ class TurbulenceParameters(Parameters):
     logarithm."""
     modes: int = Field(default=512, ge=16, le=100_000)
     """Fourier modes per slice."""
-    lifetime: Lifetime = Field(default="10 s", gt=0)  # type: ignore[assignment]
-    """How long the air keeps its structure while the wind carries it."""
+    lifetime: Lifetime = Field(default="1 s", gt=0)  # type: ignore[assignment]
+    """How long the air keeps its structure while the wind carries it; longer ones need more modes."""
     sampling: Literal["mean", "midpoint"] = "mean"
     """Turbulence all through each slice, or in one thin layer at its mid-point."""
     slope_response: Literal["centroid", "printed"] = "centroid"

@@ -150,7 +150,10 @@ class TurbulentField:
     modes : int
         Modes per slice and epoch, at least 16.
     lifetime : float
-        Seconds for which the turbulence is frozen; infinity for one set of modes for ever.
+        Seconds for which the turbulence is frozen; infinity for one set of modes for ever. In each second at
+        least as many modes should be new as there are temporal frequencies to tell apart, some hundred per
+        slice: fewer repeat themselves, and correlations scatter more than their covariance says (reduced chi2
+        of noise-free maps of 60 s: 1.05 with 512 modes a second, 1.2 with 256, 3 in 12 s with 51).
     sampling : {"mean", "midpoint"}
         Turbulence all through each slice, or in one thin layer in its middle.
     slope_response : {"centroid", "printed"}
@@ -185,7 +188,7 @@ class TurbulentField:
         frame_rate: float,
         seed: int,
         modes: int = 512,
-        lifetime: float = 10.0,
+        lifetime: float = 1.0,
         sampling: Literal["mean", "midpoint"] = "mean",
         slope_response: Literal["centroid", "printed"] = "centroid",
         statistics: Literal["linear", "lognormal"] = "linear",
@@ -441,9 +444,8 @@ class TurbulentField:
 def _add_product(waves: NDArray[np.float32], matrix: NDArray[np.float32], values: Floats) -> None:
     """Add waves @ matrix.T to values; `waves` has a multiple of four rows.
 
-    A BLAS is three times as fast on an idle machine. But it starts threads of its own below the threads that
-    draw frames, which wait for each other when other work goes on (measured: a hundred times slower), and
-    its result depends on their number.
+    A BLAS starts threads of its own below the threads that draw frames, which wait for each other when other
+    work goes on (measured: a hundred times slower), and its result depends on their number.
     """
     rows, columns, length = waves.shape[0], matrix.shape[0], waves.shape[1]
     # Stretches of all rows of both factors stay in the second-level cache, and their sums are added in double.
@@ -451,15 +453,17 @@ def _add_product(waves: NDArray[np.float32], matrix: NDArray[np.float32], values
         stop = min(start + 1024, length)
         for c in range(0, columns, 4):
             last = columns - 1
-            m0, m1 = matrix[c], matrix[min(c + 1, last)]
-            m2, m3 = matrix[min(c + 2, last)], matrix[min(c + 3, last)]
+            # Rows cut to the stretch: only then does the compiler see contiguous numbers (three times as fast).
+            m0, m1 = matrix[c, start:stop], matrix[min(c + 1, last), start:stop]
+            m2, m3 = matrix[min(c + 2, last), start:stop], matrix[min(c + 3, last), start:stop]
             for r in range(0, rows, 4):
-                w0, w1, w2, w3 = waves[r], waves[r + 1], waves[r + 2], waves[r + 3]
+                w0, w1 = waves[r, start:stop], waves[r + 1, start:stop]
+                w2, w3 = waves[r + 2, start:stop], waves[r + 3, start:stop]
                 # Sixteen sums at once: as many as there are registers, so that each number read is used four
                 # times.
                 s00 = s01 = s02 = s03 = s10 = s11 = s12 = s13 = np.float32(0.0)
                 s20 = s21 = s22 = s23 = s30 = s31 = s32 = s33 = np.float32(0.0)
-                for k in range(start, stop):
+                for k in range(stop - start):
                     a0, a1, a2, a3 = w0[k], w1[k], w2[k], w3[k]
                     b0, b1, b2, b3 = m0[k], m1[k], m2[k], m3[k]
                     s00 += a0 * b0
