@@ -44,8 +44,9 @@ from scipy import fft, linalg
 from .correlation import AUTO_MAP, CROSS_MAP, channels, pair_entry
 from .geometry import MAP_KINDS, Geometry
 
-#: Fewest ordinates of a band. With two the bias could still be removed; more make the estimate steadier.
-_FEWEST_ORDINATES = 4
+#: Fewest ordinates of a band. With two the bias could still be removed, but estimates from a few ordinates are so
+#: noisy that their inverse is far too large; with more the slopes' steep rise toward low frequencies is lost.
+_FEWEST_ORDINATES = 8
 
 #: Smallest eigenvalue kept, relative to the variances. Only records of a few dozen frames come near it.
 _FLOOR = 1e-12
@@ -141,7 +142,7 @@ def lagged(
     geometry : Geometry
         Pupil and sources.
     bands : int
-        Number of frequency bands, at most; logarithmic, of no fewer than four ordinates each.
+        Number of frequency bands, at most; logarithmic, of no fewer than eight ordinates each.
 
     Returns
     -------
@@ -151,7 +152,7 @@ def lagged(
     Raises
     ------
     ValueError
-        The shapes do not fit each other or the geometry, or the record has fewer than 16 frames.
+        The shapes do not fit each other or the geometry, or the record has fewer than 32 frames.
     """
     shape = (3, geometry.n_sources, geometry.n_subapertures)
     series = channels(slopes, flux)
@@ -161,8 +162,8 @@ def lagged(
             f"slopes and flux hold {flux.shape[1]} sources x {flux.shape[2]} subapertures, "
             f"the geometry {shape[1]} x {shape[2]}"
         )
-    if frames < 16:
-        raise ValueError(f"the convergence noise of {frames} frames cannot be estimated: 16 are needed")
+    if frames < 32:
+        raise ValueError(f"the convergence noise of {frames} frames cannot be estimated: 32 are needed")
     if bands < 1:
         raise ValueError(f"at least one frequency band is needed: got {bands}")
 

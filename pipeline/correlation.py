@@ -117,11 +117,11 @@ def channels(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> NDArra
             "slopes must be (time, 2, source, subaperture) and flux (time, source, subaperture): "
             f"got {slopes.shape} and {flux.shape}"
         )
-    frames = slopes.shape[0]
-    samples = np.empty((frames, 3, *slopes.shape[2:]))
+    frames, _, sources, subapertures = slopes.shape
+    samples = np.empty((frames, 3, sources, subapertures))
     samples[:, :2] = slopes
     samples[:, 2] = flux
-    return samples.reshape(frames, -1)
+    return samples.reshape(frames, 3 * sources * subapertures)
 
 
 def accumulate(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> CorrelationSums:
