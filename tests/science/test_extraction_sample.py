@@ -176,7 +176,7 @@ def test_moving_maximum_is_a_choice(
     np.testing.assert_allclose(index, shared_truth["sigma_I2"]["of_this_record_per_source"], rtol=0.05)
 
 
-@pytest.mark.parametrize("offset", [(0, 1), (1, 1), (-1, 2), (2, 0), (0, -3)])
+@pytest.mark.parametrize("offset", [(0, 0), (0, 1), (1, 1), (-1, 2), (2, 0), (0, -3)])
 def test_bias_of_a_replaced_pixel(
     recording: Recording, measured: tuple[SpotLayout, Array, Array, Array], offset: tuple[int, int]
 ) -> None:
@@ -197,10 +197,10 @@ def test_bias_of_a_replaced_pixel(
     assert not flag.any()
     change = (again - slopes[:1000])[:, :, 0] / found.pixel_scale
     change -= change.mean(axis=0)
-    # Detection noise is 0.04 px; the pixel must add less.
-    assert np.sqrt((change**2).mean(axis=0)).max() < 0.05
+    # Detection noise is 0.04 px; the pixel adds 0.004 px.
+    assert np.sqrt((change**2).mean(axis=0)).max() < 0.012
     for axis in range(2):
         for a in range(change.shape[-1]):
             before = slopes[:1000, axis, 0, a] / found.pixel_scale
-            assert abs(np.polyfit(before, change[:, axis, a], 1)[0]) < 0.03
+            assert abs(np.polyfit(before, change[:, axis, a], 1)[0]) < 0.012
     np.testing.assert_allclose(new_flux.mean(axis=0), flux[:1000].mean(axis=0), rtol=0.02)
