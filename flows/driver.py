@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
@@ -24,7 +25,7 @@ from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from .cluster import BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
 from .plan import ArchivePlan, BatchWindow, plan_archive
-from .settings import InputError
+from .settings import InputError, cache_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -119,7 +120,9 @@ class Work:
     _lock: Lock = field(default_factory=Lock)
 
     def __post_init__(self) -> None:
-        self.correlations, self.responses = kept_of(self.catalog.root)
+        self.correlations = kept_correlations(self.catalog.root)
+        # A response matrix depends on no recording, so all catalogs of a user share theirs.
+        self.responses = Kept(cache_folder() / "responses")
 
     def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
         """Response matrix, computed once for all archives of one geometry."""
@@ -138,14 +141,15 @@ class Work:
                     sampling=parameters.sampling,
                     slope_response=parameters.slope_response,
                 )
-                self.responses.save(digest, {"M": found})
+                with suppress(OSError):  # a cache that cannot be written only costs time
+                    self.responses.save(digest, {"M": found})
             self._matrices[digest] = found
             return found
 
 
-def kept_of(root: Path) -> tuple[Kept, Kept]:
-    """Where a catalog keeps correlations and response matrices."""
-    return Kept(root / "correlations"), Kept(root / "responses")
+def kept_correlations(root: Path) -> Kept:
+    """Where a catalog keeps the correlations of its batches."""
+    return Kept(root / "correlations")
 
 
 def model_of(plan: ArchivePlan, work: Work) -> stages.Model:

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING
 from urllib.error import URLError
 from urllib.request import ProxyHandler, build_opener
 
+from .settings import cache_folder
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -44,10 +46,8 @@ def quiet_environment() -> dict[str, str]:
 
 
 def home() -> Path:
-    """Folder of the server's database and log: COSLIDAR_HOME, or a folder in the user's cache."""
-    given = os.environ.get("COSLIDAR_HOME")
-    base = Path(given) if given else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "coslidar"
-    return base / "prefect"
+    """Folder of the server's database and log, kept between runs: migrations are the slow part of a first start."""
+    return cache_folder() / "prefect"
 
 
 def _free_port() -> int:

@@ -74,7 +74,7 @@ def plan(
     from ...catalog.store import Catalog
     from ...pipeline.units import safe
     from ..cli import complain
-    from ..driver import kept_of
+    from ..driver import kept_correlations
     from ..plan import plan_archive
     from ..settings import InputError
 
@@ -82,7 +82,7 @@ def plan(
     faults: list[str] = []
     frames = computed = 0
     catalog = Catalog(settings.output, create=False) if (settings.output / "catalog.sqlite").exists() else None
-    kept, _ = kept_of(settings.output.absolute())
+    kept = kept_correlations(settings.output.absolute())
     for url in settings.archives:
         try:
             planned = plan_archive(url, settings)
