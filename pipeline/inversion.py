@@ -547,9 +547,7 @@ def prepare(
         complement = u[:, int((s > NUISANCE_TOLERANCE * s[0]).sum()) :]
     if not complement.shape[1]:
         raise ValueError(f"{n_data} independent data are no more than the unpenalised unknowns")
-    return replace(
-        whitening, complement=complement, matrix=complement.T @ whitening.whiten(response[chosen])
-    )
+    return replace(whitening, complement=complement, matrix=complement.T @ whitening.whiten(response[chosen]))
 
 
 # --- the linear problem ----------------------------------------------------------------------------------
@@ -1025,6 +1023,9 @@ class Profile:
         M cn2 + B b on all rows, and data less model; NaN where there is neither.
     n_data : int
         Number of independent data.
+    resolution_length : ndarray, (k,)
+        Length of path that each estimate stands for, m (:func:`~.uncertainty.resolution_length`); NaN where the
+        slices were not given.
     """
 
     cn2: Floats
@@ -1045,6 +1046,7 @@ class Profile:
     model: Floats
     residual: Floats
     n_data: int
+    resolution_length: Floats
 
     @property
     def mu(self) -> float:
@@ -1060,6 +1062,11 @@ class Profile:
     def criterion(self) -> Floats:
         """Criterion curve on `log_mu_grid`."""
         return self.selection.criterion
+
+    @property
+    def posterior_mean(self) -> Floats:
+        """Mean of the posterior under positivity, (k,), m^(-2/3); NaN if there is no posterior."""
+        return np.full(len(self.cn2), np.nan) if self.posterior is None else self.posterior.mean
 
     @property
     def interval_68(self) -> Floats:
@@ -1160,6 +1167,7 @@ def estimate(
         model=model,
         residual=values - model,
         n_data=reduction.n_data,
+        resolution_length=np.full(len(best), np.nan) if grid is None else uncertainty.resolution_length(kernel, grid),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -226,6 +226,10 @@ def _log_mu(value: str | None) -> dict[str, Any]:
               help="Estimate detection noise at zero separation with the profile.")  # fmt: skip
 @click.option("--slope-offset", type=click.Choice(["joint", "none"]), default="joint", show_default=True,
               help="Estimate a constant of each axis' slope maps with the profile.")  # fmt: skip
+@click.option("--estimator", type=click.Choice(["map", "posterior_mean"]), default="map", show_default=True,
+              help="Most probable profile, or the mean of all that are possible.")  # fmt: skip
+@click.option("--subset", type=click.Choice(["all", "slopes", "scintillation", "auto", "cross"]), default="all",
+              show_default=True, help="Part of the data to use.")  # fmt: skip
 @click.option("-o", "--output", type=_OUT, required=True, help="NumPy file to write (.npz).")
 def invert(
     source: Path,
@@ -235,6 +239,8 @@ def invert(
     log_mu: str | None,
     noise_bias: str,
     slope_offset: str,
+    estimator: Literal["map", "posterior_mean"],
+    subset: str,
     output: Path,
 ) -> None:
     """Invert correlation data of your own.
@@ -243,8 +249,11 @@ def invert(
     yy_auto, xx_cross, yy_cross, ii_auto, ii_cross. Rows that no pair measures are NaN or zero; redundant rows of auto
     maps may stay, they are found and left out. An array z or edges gives the slices (equal ones without).
 
-    OUT.npz holds cn2 and error (MAP bar), (k,) or (draws, k), mu, log_mu_grid, criterion, n_independent, and
-    error_ml, averaging_kernel, degrees_of_freedom, chi2_reduced, nuisance, nuisance_error, nuisance_names, rows.
+    OUT.npz holds cn2 and error (MAP bar), (k,) or (draws, k), hpd68 and hpd95, (k, 2) or (draws, k, 2), the shortest
+    intervals that hold 68 and 95 % of the positive posterior, posterior_mean, mu, log_mu_grid, criterion,
+    n_independent, and error_ml, averaging_kernel, degrees_of_freedom, resolution_length (m; in slices where none are given),
+    chi2_reduced, nuisance, nuisance_error, nuisance_names, rows. Without a posterior, where neither data nor prior
+    bound the profile, intervals reach from 0 to infinity and posterior_mean is NaN.
     """
     import numpy as np
 
@@ -284,12 +293,19 @@ def invert(
     settings = with_plugin(settings, "selector", {"name": text, **parameters})
     try:
         reduction = inversion.prepare(
-            data, covariance, matrix, noise_bias=noise_bias == "joint", slope_offset=slope_offset == "joint"
+            data,
+            covariance,
+            matrix,
+            subset=subset,
+            noise_bias=noise_bias == "joint",
+            slope_offset=slope_offset == "joint",
         )
         precision = settings.regulariser().precision(grid)
         profiles = [
-            inversion.estimate(reduction, draw, precision, settings.selector(), grid=grid)
-            for draw in np.atleast_2d(data)
+            inversion.estimate(
+                reduction, draw, precision, settings.selector(), grid=grid, estimator=estimator, seed=number
+            )
+            for number, draw in enumerate(np.atleast_2d(data))
         ]
     except (ValueError, np.linalg.LinAlgError) as error:
         raise InputError([f"{source}: {error}"]) from error
@@ -304,6 +320,10 @@ def invert(
         cn2=stack("cn2"),
         error=stack("error_map"),
         error_ml=stack("error_ml"),
+        hpd68=stack("interval_68"),
+        hpd95=stack("interval_95"),
+        posterior_mean=stack("posterior_mean"),
+        resolution_length=stack("resolution_length"),
         mu=stack("mu"),
         log_mu_grid=np.asarray(profiles[0].log_mu_grid),
         criterion=stack("criterion"),
@@ -316,6 +336,8 @@ def invert(
         nuisance_names=np.asarray(reduction.names, dtype=str),
         rows=reduction.rows,
         z=grid.centres,
+        estimator=estimator,
+        subset=subset,
     )
     click.echo(f"{output}: {len(profiles)} profile(s) of {grid.k} slices from {reduction.n_data} independent data")
 
