@@ -22,6 +22,7 @@ from .detector import Detector, bad_pixels, lenslet_boxes, spot_profile
 from .geometry import SliceGrid
 from .parameters import FORMAT, FORMAT_VERSION, Header, Name, Parameters, Text
 from .simulation import Strength, TurbulentField
+from .turbulence import fried_parameter
 from .units import (
     AngularVariance,
     Duration,
@@ -452,6 +453,9 @@ class Recording:
         """
         scenario, geometry, grid = self.scenario, self.field.geometry, self.field.grid
         cn2 = self.field.mean_profile(0, self.n_recorded)
+        r0 = float(
+            fried_parameter(cn2, grid, geometry.wavelength, geometry.path_length, sampling=scenario.turbulence.sampling)
+        )
         tenths = np.linspace(0, self.n_recorded, 11).astype(int)
         air, vibration, gain = scenario.turbulence, scenario.vibration, self.detector.gain
         truth: dict[str, Any] = {
@@ -474,7 +478,7 @@ class Recording:
             "slope_response": air.slope_response,
             "statistics": air.statistics,
             "wind_m_per_s": np.broadcast_to(np.asarray(air.wind), (grid.k, 2)).tolist(),
-            "r0_m": fried_parameter(cn2, grid, geometry.wavelength, geometry.path_length),
+            "r0_m": r0 if math.isfinite(r0) else None,
             "vibration": None
             if vibration is None
             else {"frequency_Hz": vibration.frequency, "variance_rad2": list(vibration.variance)},
@@ -537,38 +541,6 @@ class Realised:
             "slope_variance_xx_rad2": variance[0].mean(axis=-1).tolist(),
             "slope_variance_yy_rad2": variance[1].mean(axis=-1).tolist(),
         }
-
-
-def fried_parameter(cn2: Floats, grid: SliceGrid, wavelength: float, path_length: float) -> float:
-    """Fried parameter of a spherical wave (a plane wave for an infinite path) through slices of constant Cn2.
-
-    Parameters
-    ----------
-    cn2 : ndarray, (k,)
-        Profile, m^(-2/3).
-    grid : SliceGrid
-        Slices.
-    wavelength : float
-        In m.
-    path_length : float
-        Distance of the source, m; may be infinite.
-
-    Returns
-    -------
-    float
-        r0 in m; infinite without turbulence.
-
-    Notes
-    -----
-    r0 = (0.423 k^2 integral of Cn2 (1 - z / L)^(5/3) dz)^(-3/5), Fried 1966, doi 10.1364/JOSA.56.001372.
-    """
-    edges = np.asarray(grid.edges)
-    if math.isinf(path_length):
-        weight = np.diff(edges)
-    else:
-        weight = -np.diff((1.0 - edges / path_length) ** (8.0 / 3.0)) * path_length * 3.0 / 8.0
-    total = 0.423 * (2.0 * np.pi / wavelength) ** 2 * float(cn2 @ weight)
-    return math.inf if total == 0.0 else float(total ** (-3.0 / 5.0))
 
 
 def read(table: Mapping[str, Any], origin: str) -> Scenario:

@@ -17,7 +17,7 @@ from coslidar.flows.settings import InputError
 from coslidar.flows.simulate import load_scenario, recordings, shipped, simulate, simulate_recording
 from coslidar.pipeline.detector import Detector, bad_pixels, lenslet_boxes, spot_profile
 from coslidar.pipeline.geometry import Geometry, SliceGrid
-from coslidar.pipeline.scenario import Realised, Recording, Scenario, ScenarioError, fried_parameter, read
+from coslidar.pipeline.scenario import Realised, Recording, Scenario, ScenarioError, read
 from coslidar.pipeline.simulation import Strength, TurbulentField
 from coslidar.plugins.source_models import Gaussian, Point
 from coslidar.plugins.turbulence_spectra import Kolmogorov
@@ -502,6 +502,7 @@ def test_the_vibration_line_has_its_variance_and_frequency_in_all_spots_alike() 
     recording = recordings(read(quiet(), "test"))[0]
     slopes, flux = recording.signals(0, 1420)
     np.testing.assert_array_equal(flux, 1.0)
+    assert recording.truth()["r0_m"] is None
     # 1420 frames of 142 Hz are 500 whole periods of 50 Hz: the variance is that of the line, not of a sample.
     for axis, variance in ((0, 1e-12), (1, 4e-12)):
         assert slopes[:, axis, 1, 7].var() == pytest.approx(variance, rel=1e-9)
@@ -570,17 +571,6 @@ def test_realised_variances_are_those_of_numpy() -> None:
     np.testing.assert_allclose(found["slope_variance_yy_rad2"], slopes[:, 1].var(axis=0).mean(axis=1), rtol=1e-10)
     index = (flux.var(axis=0) / flux.mean(axis=0) ** 2).mean(axis=1)
     np.testing.assert_allclose(found["sigma_I2"], index, rtol=1e-10)
-
-
-def test_fried_parameter_by_quadrature() -> None:
-    grid = SliceGrid.uniform(LENGTH, 4)
-    cn2 = np.array([1.0, 2.0, 0.5, 3.0]) * 1e-14
-    integral, _ = quad(
-        lambda z: cn2[min(int(z / LENGTH * 4), 3)] * (1 - z / LENGTH) ** (5 / 3), 0, LENGTH, points=grid.edges[1:-1]
-    )
-    expected = (0.423 * (2 * np.pi / WAVELENGTH) ** 2 * integral) ** -0.6
-    assert fried_parameter(cn2, grid, WAVELENGTH, LENGTH) == pytest.approx(expected, rel=1e-8)
-    assert fried_parameter(0 * cn2, grid, WAVELENGTH, LENGTH) == np.inf
 
 
 def test_written_archives_hold_the_frames_and_their_truth(tmp_path: Path) -> None:
