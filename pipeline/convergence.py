@@ -129,9 +129,9 @@ def lagged(
     """Covariance of the maps of frames that are correlated in time, Eq. (2) of this module.
 
     Frames are taken as equally spaced. Missing samples are set to the mean of their channel; the maps weight
-    each pair by its frames, and the number of samples left enters in the same way here. That is exact for
-    gaps that strike channels independently, and too large by at most N / N_valid for frames lost in all
-    channels together.
+    each pair by its frames, and the number of samples left enters in the same way here. That is exact for gaps
+    that strike channels independently, and too large by at most N / N_valid for frames lost in all channels together
+    and for the zero separation.
 
     Parameters
     ----------
@@ -254,15 +254,12 @@ def deviation_maps(matrix: NDArray[np.float64], geometry: Geometry) -> NDArray[n
     return np.where(known, deviation, np.nan).reshape(len(MAP_KINDS), *geometry.map_shape)
 
 
-def _independent_row(
-    matrix: NDArray[np.float64], geometry: Geometry
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _independent_row(matrix: NDArray[np.float64], geometry: Geometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Row of the independent data that each row of the data vector repeats, and whether there is one."""
     kept = geometry.independent
     if matrix.shape != (kept.size, kept.size):
         raise ValueError(
-            f"the matrix must be ({kept.size}, {kept.size}), one row for each independent datum: "
-            f"got {matrix.shape}"
+            f"the matrix must be ({kept.size}, {kept.size}), one row for each independent datum: got {matrix.shape}"
         )
     position = np.full(geometry.valid.size, -1)
     position[kept] = np.arange(kept.size)
@@ -495,10 +492,7 @@ def _squared_traces(
             traces[CROSS_MAP[kind]] = trace(kind, 0, 1)[:, kept[CROSS_MAP[kind]]]
     return np.block(
         [
-            [
-                (first * weights[:, signal[one], signal[other], None]).T @ second
-                for other, second in enumerate(traces)
-            ]
+            [(first * weights[:, signal[one], signal[other], None]).T @ second for other, second in enumerate(traces)]
             for one, first in enumerate(traces)
         ]
     )
@@ -542,10 +536,9 @@ def _assemble(
     count = pairs.ravel()[kept]
     unit = unit[kept // entries]
 
-    deviation = np.sqrt(np.diagonal(products))
-    measured = (count > 0) & (deviation > 0)
-    rows = np.flatnonzero(measured)
-    correlation = products[np.ix_(rows, rows)] / np.outer(deviation[rows], deviation[rows])
+    rows = np.flatnonzero((count > 0) & (np.diagonal(products) > 0))
+    deviation = np.sqrt(np.diagonal(products)[rows])
+    correlation = products[np.ix_(rows, rows)] / np.outer(deviation, deviation)
     correlation = (correlation + correlation.T) / 2
     try:
         linalg.cholesky(correlation)
@@ -553,7 +546,7 @@ def _assemble(
         values, vectors = linalg.eigh(correlation)
         correlation = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
         correlation = (correlation + correlation.T) / 2
-    error = deviation[rows] * unit[rows] / count[rows]
+    error = deviation * unit[rows] / count[rows]
     covariance = np.full((kept.size, kept.size), np.nan)
     covariance[np.ix_(rows, rows)] = correlation * np.outer(error, error)
     return covariance

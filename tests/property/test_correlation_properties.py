@@ -53,9 +53,7 @@ def assert_equal(one: CorrelationSums, other: CorrelationSums):
 def test_any_chunking_gives_the_same_maps(record, cuts):
     slopes, flux = record
     edges = [0, *sorted(min(cut, len(slopes)) for cut in cuts), len(slopes)]
-    parts = [
-        correlation.accumulate(slopes[a:b], flux[a:b]) for a, b in itertools.pairwise(edges)
-    ]
+    parts = [correlation.accumulate(slopes[a:b], flux[a:b]) for a, b in itertools.pairwise(edges)]
     whole = correlation.finalise(correlation.accumulate(slopes, flux), GEOMETRY)
     merged = correlation.finalise(functools.reduce(correlation.merge, parts), GEOMETRY)
     np.testing.assert_array_equal(whole.pair_count, merged.pair_count)

@@ -75,9 +75,7 @@ def test_complete_maps_have_the_pairs_of_the_geometry():
 def test_auto_map_is_the_mean_of_both_sources():
     slopes, flux = record(TWO, 50)
     both = correlation.finalise(correlation.accumulate(slopes, flux), TWO).maps
-    each = [
-        correlation.finalise(correlation.accumulate(slopes[:, :, [s]], flux[:, [s]]), ONE).maps for s in (0, 1)
-    ]
+    each = [correlation.finalise(correlation.accumulate(slopes[:, :, [s]], flux[:, [s]]), ONE).maps for s in (0, 1)]
     for number, name in enumerate(MAP_KINDS):
         if name.endswith("auto"):
             np.testing.assert_allclose(both[number], (each[0][number] + each[1][number]) / 2, rtol=1e-10)
@@ -124,9 +122,7 @@ def test_ridge_along_x_and_y_of_an_oblique_pair():
     pattern = rng.standard_normal((3, 4000, 25, 25))
     i, j = index.T
     seen = np.stack([pattern[:, :, i, j], pattern[:, :, i + 1, j - 2]], axis=2)
-    maps = correlation.finalise(
-        correlation.accumulate(np.moveaxis(seen[:2], 0, 1), 1000 + 50 * seen[2]), TWO
-    ).maps
+    maps = correlation.finalise(correlation.accumulate(np.moveaxis(seen[:2], 0, 1), 1000 + 50 * seen[2]), TWO).maps
     for number in (2, 3, 5):
         dy, dx = np.unravel_index(np.nanargmax(maps[number]), TWO.map_shape)
         assert (dy - 4, dx - 4) == (1, -2)
