@@ -446,22 +446,24 @@ def _trace_products(
 
     for one in range(3):
         for other in range(one, 3):
-            block = blocks[:, one, :, :, other].transpose(1, 3, 0, 2, 4)  # source, source, spectrum, a, c
-            block = block * np.sqrt(weights[:, one, other, None, None])
-            transform = pupil @ block.astype(np.complex128) @ pupil.T
-            power = np.einsum("acsuv,acsuv->uv", transform.real, transform.real)
-            power += np.einsum("acsuv,acsuv->uv", transform.imag, transform.imag)
+            power = np.zeros((pupil.shape[0],) * 2)
+            swapped, upper, straight, crossed = np.zeros((4, *power.shape), np.complex128)
+            # One spectrum at a time stays in the processor's cache, and small for instruments with many lenslets.
+            for matrix, weight in zip(blocks, np.sqrt(weights[:, one, other]), strict=True):
+                block = matrix[one, :, :, other].transpose(0, 2, 1, 3) * weight  # source, source, a, c
+                transform = pupil @ block.astype(np.complex128) @ pupil.T
+                power += np.sum(transform.real**2 + transform.imag**2, axis=(0, 1))
+                if sources == 2:
+                    conjugate = transform.conj()
+                    swapped += transform[0, 1] * conjugate[0, 0] + transform[1, 1] * conjugate[1, 0]
+                    upper += transform[0, 0] * conjugate[1, 0] + transform[0, 1] * conjugate[1, 1]
+                    straight += transform[0, 0] * conjugate[1, 1]
+                    crossed += transform[0, 1] * conjugate[1, 0]
             put(AUTO_MAP[one], AUTO_MAP[other], correlation(power, power))
-            if sources == 1:
-                continue
-            conjugate = transform.conj()
-            swapped = np.einsum("asuv,asuv->uv", transform[:, 1], conjugate[:, 0])
-            put(AUTO_MAP[one], CROSS_MAP[other], correlation(swapped.conj(), swapped))
-            upper = np.einsum("csuv,csuv->uv", transform[0], conjugate[1])
-            put(CROSS_MAP[one], AUTO_MAP[other], correlation(upper, upper))
-            straight = np.einsum("suv,suv->uv", transform[0, 0], conjugate[1, 1])
-            crossed = np.einsum("suv,suv->uv", transform[0, 1], conjugate[1, 0])
-            put(CROSS_MAP[one], CROSS_MAP[other], correlation(straight, crossed))
+            if sources == 2:
+                put(AUTO_MAP[one], CROSS_MAP[other], correlation(swapped.conj(), swapped))
+                put(CROSS_MAP[one], AUTO_MAP[other], correlation(upper, upper))
+                put(CROSS_MAP[one], CROSS_MAP[other], correlation(straight, crossed))
     return products
 
 
