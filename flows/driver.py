@@ -8,10 +8,11 @@ same command goes on where it was.
 from __future__ import annotations
 
 import logging
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
-from threading import Lock
+from queue import Empty, SimpleQueue
+from threading import Event, Lock
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -21,9 +22,10 @@ from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
 from ..pipeline import response
+from ..pipeline.products import QUALITY_FLAGS
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
-from .cluster import BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
+from .cluster import ALLOWED_FAILURES, BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
 from .plan import ArchivePlan, BatchWindow, plan_archive
 from .settings import InputError, cache_folder
 
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
-    from distributed import Client
+    from distributed import Client, Future
     from numpy.typing import NDArray
 
     from ..catalog.store import Catalog
@@ -42,6 +44,12 @@ log = logging.getLogger("coslidar")
 
 #: Batches per worker thread that are under way at once: enough that none idles, few enough that memory stays flat.
 AHEAD = 2
+#: How often those who wait look whether the run is to stop, s.
+PATIENCE = 0.2
+
+
+class Stopped(BaseException):
+    """The run is to stop; raised in the threads of its archives, past everything that handles faults."""
 
 
 class Progress(Protocol):
@@ -68,7 +76,8 @@ class ArchiveOutcome:
     name : str
         Campaign and archive; the url where it could not be opened.
     status : str
-        ``published``, ``present`` (nothing to do), ``refused`` (its input is at fault) or ``failed``.
+        ``published``, ``present`` (nothing to do), ``refused`` (its input is at fault), ``failed``, or
+        ``cancelled`` (the run was interrupted).
     batches, failed_batches, reused, frames_read : int
         Batches in all, those that failed, those that were there already, and frames that were read.
     faults : tuple of str
@@ -116,6 +125,7 @@ class Work:
     progress: Progress
     correlations: Kept = field(init=False)
     responses: Kept = field(init=False)
+    stopping: Event = field(default_factory=Event)
     _matrices: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
@@ -123,6 +133,11 @@ class Work:
         self.correlations = kept_correlations(self.catalog.root)
         # A response matrix depends on no recording, so all catalogs of a user share theirs.
         self.responses = Kept(cache_folder() / "responses")
+
+    def check(self) -> None:
+        """Raise Stopped where the run is to stop."""
+        if self.stopping.is_set():
+            raise Stopped
 
     def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
         """Response matrix, computed once for all archives of one geometry."""
@@ -169,11 +184,14 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
     """Process one archive; never raises for what is wrong with it."""
     name = safe(url)
     try:
+        work.check()
         plan = plan_archive(url, work.settings)
         name = plan.name
         outcome = _process(plan, work)
     except (ArchiveError, InputError, PluginError) as error:
         outcome = ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
+    except Stopped:
+        return ArchiveOutcome(url, name, "cancelled")
     except Exception as error:
         # Whatever else goes wrong with one archive must not take the others down.
         log.debug("archive %s failed", url, exc_info=True)
@@ -190,7 +208,18 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     catalog, digest = work.catalog, str(plan.profile_key)
     if catalog.has(plan.archive.identity, digest):
         row = catalog.products(archive_identity=plan.archive.identity, lineage_key=digest)[0]
-        return ArchiveOutcome(plan.url, plan.name, "present", batches=row.batches, product=str(row.path))
+        batches = catalog.batches(lineage_key=digest)
+        lost = sum(bool(batch.quality_flag & QUALITY_FLAGS["failed"][0]) for batch in batches)
+        # The same command says the same again, whether it is the first or the second time that it gets so far.
+        return ArchiveOutcome(
+            plan.url,
+            plan.name,
+            "present",
+            batches=row.batches,
+            failed_batches=lost,
+            product=str(row.path),
+            input_fault=lost > 0,
+        )
     remember(plan.archive)
     done: dict[int, BatchResult] = {}
     for window in plan.windows:
@@ -206,7 +235,7 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
             work.correlations.save(plan.correlation_key(window), as_stored(outcome.reduced))
         if outcome.transient:
             transient = True
-        else:
+        elif outcome.lasting:
             catalog.scratch.save(plan.result_key(window), outcome.result)
         done[window.index] = outcome.result
         if outcome.result.reason:
@@ -269,6 +298,10 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
         "spectrum": settings.plugins["spectrum"]["name"],
         "regulariser": settings.plugins["regulariser"]["name"],
         "selector": settings.plugins["selector"]["name"],
+        "estimator": parameters.inversion.estimator,
+        "data_subset": parameters.inversion.subset,
+        "noise_bias": parameters.inversion.noise_bias,
+        "slope_offset": parameters.inversion.slope_offset,
     }
     if header.site is not None:
         for key in ("name", "timezone"):
@@ -279,19 +312,19 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
 
 def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator[tuple[BatchWindow, BatchOutcome]]:
     """Send batches to the workers, a few ahead, and yield them as they come back."""
-    from distributed import as_completed
-
     if not todo:
         return
     settings, client = work.settings, work.client
-    model = client.scatter(model_of(plan, work), broadcast=True, hash=False)
-    threads = max(1, sum(client.nthreads().values()))
+    # The model travels with every batch: a few kB, and no worker that dies can take the only copy along.
+    model = model_of(plan, work)
     waiting = iter(todo)
+    flying: dict[str, tuple[Future, BatchWindow]] = {}
+    back: SimpleQueue[Future] = SimpleQueue()
 
-    def submit() -> Any:
+    def submit() -> None:
         window = next(waiting, None)
         if window is None:
-            return None
+            return
         stored = work.correlations.load(plan.correlation_key(window))
         task = BatchTask(
             url=plan.url,
@@ -304,31 +337,44 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
             reduced=from_stored(stored) if stored else None,
         )
         future = client.submit(process_batch, task, model, pure=False, key=f"{plan.name}-{window.index}-{id(task):x}")
-        windows[future.key] = window
-        return future
+        flying[future.key] = (future, window)
+        future.add_done_callback(back.put)
 
-    windows: dict[str, BatchWindow] = {}
-    flying = as_completed()
-    for _ in range(threads * AHEAD):
-        if (future := submit()) is not None:
-            flying.add(future)
     try:
-        for future in flying:
-            window = windows.pop(future.key)
+        for _ in range(max(1, sum(client.nthreads().values())) * AHEAD):
+            submit()
+        while flying:
+            work.check()
             try:
-                outcome = future.result()
-            except Exception as error:
-                reason = f"{type(error).__name__}: {safe(str(error))}"
-                log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
-                result = stages.failed(window.start_time, window.stop_time, reason)
-                outcome = BatchOutcome(window, result, None, 0, transient=True)
+                future = back.get(timeout=PATIENCE)
+            except Empty:
+                continue
+            _, window = flying.pop(future.key)
+            outcome = _outcome(future, window, plan)
             future.release()
-            if (following := submit()) is not None:
-                flying.add(following)
+            submit()
             yield window, outcome
     finally:
-        for future in list(flying.futures):
-            future.cancel()
+        with suppress(Exception):  # the scheduler may be what is gone
+            client.cancel([future for future, _ in flying.values()])
+
+
+def _outcome(future: Future, window: BatchWindow, plan: ArchivePlan) -> BatchOutcome:
+    """What a worker sent back; a fault of the machine is one of this try only."""
+    from distributed import KilledWorker
+
+    try:
+        result: BatchOutcome = future.result()
+        return result
+    except KilledWorker:
+        reason = f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
+    except CancelledError:
+        reason = "the Dask scheduler was lost"
+    except Exception as error:
+        log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
+        reason = f"{type(error).__name__}: {safe(str(error))}"
+    result = BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0, transient=True)
+    return result
 
 
 def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[ArchiveOutcome]]) -> list[ArchiveOutcome]:
@@ -348,11 +394,7 @@ def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[Arc
     list of ArchiveOutcome
         In the order of `archives`.
     """
-    try:
-        outcomes = fan_out(process_archive, list(archives), work)
-    except BaseException:
-        work.catalog.finish_run(work.run, "cancelled")
-        raise
+    outcomes = fan_out(process_archive, list(archives), work)
     complete = all(outcome.status in ("published", "present") for outcome in outcomes)
     work.catalog.finish_run(work.run, "finished" if complete else "failed")
     return outcomes
@@ -366,8 +408,8 @@ def in_threads(process: Callable[[str, Work], ArchiveOutcome], archives: list[st
             pending = set(futures)
             while pending:
                 # Short waits, so that an interrupt is noticed at once.
-                _, pending = wait(pending, timeout=0.5, return_when=FIRST_COMPLETED)
+                _, pending = wait(pending, timeout=PATIENCE, return_when=FIRST_COMPLETED)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            work.stopping.set()
             raise
     return [future.result() for future in futures]

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import convergence, correlation, extraction, inversion, noise, turbulence
+from . import convergence, correlation, extraction, inversion, noise, posterior, turbulence
 from .geometry import MAP_KINDS
 from .products import INTENSITY_KINDS, QUALITY_FLAGS, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 1
 RESPONSE_VERSION = 1
-RETRIEVE_VERSION = 1
+RETRIEVE_VERSION = 2
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
@@ -84,7 +84,7 @@ class Model:
     regulariser, selector
         Plugins.
     inversion : InversionParameters
-        Unpenalised unknowns.
+        Data used, unpenalised unknowns, estimator.
     """
 
     geometry: Geometry
@@ -277,6 +277,8 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
             regulariser=model.regulariser,
             selector=model.selector,
             rows=geometry.independent,
+            subset=model.inversion.subset,
+            estimator=model.inversion.estimator,
             noise_bias=model.inversion.noise_bias == "joint",
             slope_offset=model.inversion.slope_offset == "joint",
             # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
@@ -292,18 +294,41 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
     intensity = [MAP_KINDS.index(kind) for kind in INTENSITY_KINDS]
     unknown = dict(zip(profile.nuisance_names, zip(profile.nuisance, profile.nuisance_error, strict=True), strict=True))
 
-    def joint(*names: str) -> NDArray[np.float64]:
-        return np.array([unknown.get(name, (np.nan, np.nan))[0] for name in names])
+    def joint(*names: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Values and standard errors of unpenalised unknowns, NaN for those that were left out."""
+        found = np.array([unknown.get(name, (np.nan, np.nan)) for name in names])
+        return found[:, 0], found[:, 1]
+
+    def interval(quantity: Callable[[NDArray[np.float64]], Any]) -> NDArray[np.float64]:
+        """Interval of 68 % of what follows from a profile, from that of each draw of the posterior."""
+        if profile.posterior is None:
+            return np.array([0.0, np.inf])
+        return posterior.highest_density_interval(np.asarray(quantity(profile.posterior.draws)), 0.68)
+
+    def fried(cn2: NDArray[np.float64]) -> Any:
+        return turbulence.fried_parameter(cn2, *light, sampling=model.sampling)
+
+    def index(cn2: NDArray[np.float64]) -> Any:
+        return turbulence.scintillation_index(cn2, model.matrix, geometry)
+
+    def path_mean(cn2: NDArray[np.float64]) -> Any:
+        return turbulence.path_average(cn2, grid.thickness)
 
     light = (grid, geometry.wavelength, geometry.path_length)
     point = float(turbulence.point_source_index(profile.cn2, *light, sampling=model.sampling))
-    fried = turbulence.fried_parameter(profile.cn2, *light, sampling=model.sampling)
+    slope_noise, slope_noise_error = joint("noise_bias_x", "noise_bias_y")
+    intensity_noise, intensity_noise_error = joint("noise_bias_i")
+    offset, offset_error = joint("slope_offset_x", "slope_offset_y")
     values: dict[str, Any] = {
         "cn2": profile.cn2,
         "cn2_standard_error": profile.error_map,
         "cn2_standard_error_ml": profile.error_ml,
         "cn2_interval_68": profile.interval_68,
         "cn2_interval_95": profile.interval_95,
+        "cn2_posterior_mean": profile.posterior_mean,
+        "resolution_length": profile.resolution_length,
+        "cn2_path_mean": path_mean(profile.cn2),
+        "cn2_path_mean_interval_68": interval(path_mean),
         "cn2_at_bound": profile.at_bound,
         "averaging_kernel": profile.averaging_kernel,
         "degrees_of_freedom": profile.degrees_of_freedom,
@@ -316,14 +341,19 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
         "intensity_correlation": arrays["maps"][intensity],
         "intensity_correlation_model": fitted[intensity],
         "intensity_correlation_error": deviation[intensity],
-        "r0_profile": fried,
+        "r0_profile": fried(profile.cn2),
+        "r0_interval_68": interval(fried),
         "scintillation_index_direct": arrays["scintillation_index"],
-        "scintillation_index_profile": turbulence.scintillation_index(profile.cn2, model.matrix, geometry),
+        "scintillation_index_profile": index(profile.cn2),
+        "scintillation_index_interval_68": interval(index),
         "scintillation_index_point": point,
         "mean_flux": arrays["mean_flux"],
-        "noise_variance_slope": joint("noise_bias_x", "noise_bias_y"),
-        "noise_variance_intensity": joint("noise_bias_i")[0],
-        "slope_offset": joint("slope_offset_x", "slope_offset_y"),
+        "noise_variance_slope": slope_noise,
+        "noise_variance_slope_error": slope_noise_error,
+        "noise_variance_intensity": intensity_noise[0],
+        "noise_variance_intensity_error": intensity_noise_error[0],
+        "slope_offset": offset,
+        "slope_offset_error": offset_error,
         "n_frames": arrays["n_frames"],
         "n_effective": arrays["n_effective"],
         "valid_fraction": arrays["valid_fraction"],

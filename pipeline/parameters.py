@@ -120,8 +120,13 @@ class ResponseParameters(Parameters):
 
 
 class InversionParameters(Parameters):
-    """Unpenalised unknowns that are estimated together with the profile."""
+    """What is inverted, what is estimated beside the profile, and which profile is reported."""
 
+    estimator: Literal["map", "posterior_mean"] = "map"
+    """`map`: the most probable profile (Sauvage et al. 2021); `posterior_mean`: the mean of all profiles that are
+    possible, weighted with their probability. Both are held at Cn2 >= 0."""
+    subset: Literal["all", "slopes", "scintillation", "auto", "cross"] = "all"
+    """Part of the correlation maps that is used."""
     noise_bias: Literal["joint", "none"] = "joint"
     """Detection noise on the zero separation of each auto-correlation map."""
     slope_offset: Literal["joint", "none"] = "joint"

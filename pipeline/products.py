@@ -60,8 +60,7 @@ class Variable:
 
 def _schema(*rows: tuple[str, str, str, str, str]) -> dict[str, Variable]:
     return {
-        name: Variable(name, tuple(dims.split()), unit, dtype, long_name)
-        for name, dims, unit, dtype, long_name in rows
+        name: Variable(name, tuple(dims.split()), unit, dtype, long_name) for name, dims, unit, dtype, long_name in rows
     }
 
 
@@ -88,6 +87,10 @@ SCHEMA = _schema(
     ("cn2_standard_error_ml", "time z", "m^(-2/3)", "float64", "maximum-likelihood error bar of Cn2"),
     ("cn2_interval_68", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 68 %"),
     ("cn2_interval_95", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 95 %"),
+    ("cn2_posterior_mean", "time z", "m^(-2/3)", "float64", "mean of the positive posterior of Cn2"),
+    ("resolution_length", "time z", "m", "float64", "length of path that an estimate stands for"),
+    ("cn2_path_mean", "time", "m^(-2/3)", "float64", "mean of Cn2 along the path"),
+    ("cn2_path_mean_interval_68", "time bound", "m^(-2/3)", "float64", "shortest interval of it holding 68 %"),
     ("cn2_at_bound", "time z", "1", "uint8", "1 where the positivity constraint is active"),
     ("averaging_kernel", "time z z_true", "1", "float64", "response of the retrieved to the true profile"),
     ("degrees_of_freedom", "time", "1", "float64", "degrees of freedom for signal"),
@@ -101,13 +104,18 @@ SCHEMA = _schema(
     ("intensity_correlation_error", "time intensity_kind dy dx", "1", "float64", "convergence noise, 1 sigma"),
     ("pair_count", "dy dx", "1", "int64", "pairs of subapertures of a separation"),
     ("r0_profile", "time", "m", "float64", "Fried parameter of a spherical wave, from the profile"),
+    ("r0_interval_68", "time bound", "m", "float64", "shortest interval of r0_profile holding 68 %"),
     ("scintillation_index_direct", "time source", "1", "float64", "variance of the relative flux, noise removed"),
     ("scintillation_index_profile", "time", "1", "float64", "aperture- and source-averaged index of the profile"),
+    ("scintillation_index_interval_68", "time bound", "1", "float64", "shortest interval of it holding 68 %"),
     ("scintillation_index_point", "time", "1", "float64", "index of one point of the source, from the profile"),
     ("mean_flux", "time source", "count", "float64", "mean flux of a spot"),
     ("noise_variance_slope", "time axis", "rad^2", "float64", "detection noise of the slopes, joint estimate"),
     ("noise_variance_intensity", "time", "1", "float64", "detection noise of the relative flux, joint estimate"),
+    ("noise_variance_slope_error", "time axis", "rad^2", "float64", "standard error of noise_variance_slope"),
+    ("noise_variance_intensity_error", "time", "1", "float64", "standard error of noise_variance_intensity"),
     ("slope_offset", "time axis", "rad^2", "float64", "constant of the slope maps, joint estimate"),
+    ("slope_offset_error", "time axis", "rad^2", "float64", "standard error of slope_offset"),
     ("n_frames", "time", "1", "int64", "frames in the batch"),
     ("n_effective", "time axis_kind", "1", "float64", "effectively independent frames for x, y slopes and flux"),
     ("valid_fraction", "time source", "1", "float64", "fraction of slopes and fluxes that could be measured"),

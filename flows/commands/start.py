@@ -38,6 +38,8 @@ duration = "{duration}"             # averaging window of one profile
 # extent = "2 km"                   # end of the slices; needed for sources at infinity
 
 [inversion]
+# estimator = "map"                 # most probable profile; or "posterior_mean"
+# subset = "all"                    # or "slopes", "scintillation", "auto", "cross"
 # noise_bias = "joint"              # or "none"
 # slope_offset = "joint"            # or "none"
 

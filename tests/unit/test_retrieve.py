@@ -1,0 +1,155 @@
+"""The retrieval of a batch: what it records, and intervals of what follows from a profile."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from coslidar.pipeline import batch
+from coslidar.pipeline.geometry import Geometry, SliceGrid
+from coslidar.pipeline.parameters import InversionParameters
+from coslidar.pipeline.products import SCHEMA
+from coslidar.pipeline.response import response_matrix
+from coslidar.plugins.hyperparameter_selectors import GCV, Fixed
+from coslidar.plugins.regularisers import White
+from coslidar.plugins.source_models import Gaussian
+from coslidar.plugins.turbulence_spectra import Kolmogorov
+
+MASK = ((0, 1, 1, 1, 0), (1, 1, 1, 1, 1), (1, 1, 0, 1, 1), (1, 1, 1, 1, 1), (0, 1, 1, 1, 0))
+GEOMETRY = Geometry(MASK, 0.07, 2670.0, 3.8e-6, ((0.0, -0.4), (0.0, 0.4)))
+LENGTH, CN2 = 2670.0, 2e-14
+ZERO = [40, 121, 364]
+"""Zero separation of the auto maps of x, y and intensity."""
+
+
+@pytest.fixture(scope="module")
+def matrix() -> np.ndarray:
+    source = Gaussian(fwhm_x="8.9 cm", fwhm_y="6.3 cm")
+    return response_matrix(GEOMETRY, SliceGrid.uniform(LENGTH, 6), Kolmogorov(), [source] * 2, sampling="midpoint")
+
+
+def reduced(maps: np.ndarray) -> batch.ReducedBatch:
+    """Correlations with 5 % noise in each entry of each kind, alike in all and independent."""
+    size = np.repeat(np.nanmax(np.abs(maps.reshape(6, 81)), axis=1), 81)[GEOMETRY.independent]
+    return batch.ReducedBatch(
+        start=1_600_000_000_000_000_000,
+        stop=1_600_000_180_000_000_000,
+        quality_flag=0,
+        arrays={
+            "maps": maps.reshape(6, 9, 9),
+            "noise_covariance": np.diag((0.05 * size) ** 2),
+            "n_effective": np.full(3, 1000.0),
+            "mean_flux": np.full(2, 1e4),
+            "scintillation_index": np.full(2, 0.02),
+            "valid_fraction": np.ones(2),
+            "n_frames": np.asarray(25560),
+        },
+    )
+
+
+def retrieve(matrix: np.ndarray, maps: np.ndarray, selector: Any = None, **inversion: Any) -> batch.BatchResult:
+    model = batch.Model(
+        geometry=GEOMETRY,
+        grid=SliceGrid.uniform(LENGTH, matrix.shape[1]),
+        matrix=matrix,
+        sampling="midpoint",
+        regulariser=White(),
+        selector=selector or GCV(),
+        inversion=InversionParameters(**inversion),
+    )
+    return batch.retrieve(reduced(maps), model)
+
+
+def test_every_promised_variable_is_delivered(matrix: np.ndarray) -> None:
+    found = retrieve(matrix, matrix @ np.full(6, CN2))
+    sizes = {"z": 6, "z_true": 6, "dy": 9, "dx": 9, "bound": 2, "axis": 2, "source": 2, "axis_kind": 3,
+             "slope_kind": 4, "intensity_kind": 2, "log_mu_grid": 41}  # fmt: skip
+    from_elsewhere = {"time_bounds", "z_bounds", "pair_count", "quality_flag", "quality_level"}
+    assert set(found.values) - {"log_mu_grid"} == set(SCHEMA) - from_elsewhere
+    for name in set(SCHEMA) - from_elsewhere:
+        assert found.values[name].shape == tuple(sizes[dim] for dim in SCHEMA[name].dims if dim != "time"), name
+
+
+def test_intervals_hold_68_percent_of_a_known_posterior(matrix: np.ndarray) -> None:
+    """One slice far from 0: a normal posterior, and quantities that are monotone in Cn2.
+
+    r0 by Fried's formula for one layer at mid-path; 8192 draws leave 0.5 % of probability, the middle of the nearly
+    shortest intervals some percent of it.
+    """
+    column = matrix.sum(axis=1, keepdims=True)
+    found = retrieve(column, column[:, 0] * CN2, Fixed(mu="1e20 m^(4/3)")).values
+    normal = stats.norm(found["cn2"][0], found["cn2_standard_error"][0])
+
+    def held(ends: np.ndarray) -> float:
+        return float(abs(normal.cdf(ends[1]) - normal.cdf(ends[0])))
+
+    layer = 0.423 * (2 * np.pi / 3.8e-6) ** 2 * 0.5 ** (5 / 3) * LENGTH
+    assert found["r0_profile"] == pytest.approx((layer * found["cn2"][0]) ** -0.6, rel=1e-9)
+    assert held(found["r0_interval_68"] ** (-5 / 3) / layer) == pytest.approx(0.68, abs=0.02)
+    assert held(found["cn2_path_mean_interval_68"]) == pytest.approx(0.68, abs=0.02)
+    assert held(found["scintillation_index_interval_68"] / column[ZERO[2], 0]) == pytest.approx(0.68, abs=0.02)
+    assert found["cn2_path_mean"] == found["cn2"][0]
+
+
+def test_path_mean_is_better_known_than_its_slices(matrix: np.ndarray) -> None:
+    """Errors of neighbouring slices cancel in the mean: its interval is shorter than the mean of theirs."""
+    found = retrieve(matrix, matrix @ np.full(6, CN2)).values
+    low, high = found["cn2_path_mean_interval_68"]
+    assert low < CN2 < high
+    assert high - low < 0.7 * np.diff(found["cn2_interval_68"]).mean()
+
+
+def test_unknowns_and_their_errors(matrix: np.ndarray) -> None:
+    """What is added to the data is found again; an error is at least what the data's noise leaves at known Cn2."""
+    maps = matrix @ np.full(6, CN2)
+    shifted = maps.reshape(6, 81).copy()
+    noise = np.array([3e-13, 4e-13, 2e-3])
+    shifted[[0, 1, 4], 40] += noise
+    shifted[[0, 2]] += 1e-12
+    shifted[[1, 3]] -= 2e-12
+    before, after = retrieve(matrix, maps).values, retrieve(matrix, shifted.ravel()).values
+    assert after["noise_variance_slope"] - before["noise_variance_slope"] == pytest.approx(noise[:2], rel=0.02)
+    assert after["noise_variance_intensity"] - before["noise_variance_intensity"] == pytest.approx(2e-3, rel=0.02)
+    assert after["slope_offset"] - before["slope_offset"] == pytest.approx([1e-12, -2e-12], rel=0.02)
+    deviation = 0.05 * np.abs(maps[ZERO])
+    assert (before["noise_variance_slope_error"] > deviation[:2]).all()
+    assert deviation[2] < before["noise_variance_intensity_error"] < 3 * deviation[2]
+    # At known Cn2 the constant of an axis is the mean of its entries: 35 of the auto map and 69 of the cross map.
+    assert (before["slope_offset_error"] > deviation[:2] / np.sqrt(104)).all()
+
+
+def test_unknowns_left_out_are_nan(matrix: np.ndarray) -> None:
+    found = retrieve(matrix, matrix @ np.full(6, CN2), noise_bias="none").values
+    assert np.isnan(found["noise_variance_slope"]).all()
+    assert np.isnan(found["noise_variance_slope_error"]).all()
+    assert np.isnan(found["noise_variance_intensity_error"])
+    assert np.isfinite(found["slope_offset_error"]).all()
+
+
+def test_subset_and_estimator_of_the_configuration(matrix: np.ndarray) -> None:
+    """With slope maps a tenth of what the profile gives, only the scintillation tells the truth."""
+    maps = (matrix @ np.full(6, CN2)).reshape(6, 81).copy()
+    maps[:4] *= 0.1
+    flux = retrieve(matrix, maps.ravel(), subset="scintillation").values
+    slopes = retrieve(matrix, maps.ravel(), subset="slopes").values
+    assert flux["scintillation_index_profile"] == pytest.approx(maps[4, 40], rel=0.03)
+    assert slopes["cn2_path_mean"] == pytest.approx(0.1 * CN2, rel=0.2)
+    mean = retrieve(matrix, maps.ravel(), subset="scintillation", estimator="posterior_mean").values
+    np.testing.assert_array_equal(mean["cn2"], mean["cn2_posterior_mean"])
+    np.testing.assert_array_equal(flux["cn2_posterior_mean"], mean["cn2_posterior_mean"])
+
+
+def test_a_retrieval_costs_less_than_a_tenth_of_a_second(matrix: np.ndarray) -> None:
+    """CPU of the second call and later, least of three: the first one compiles; twelve slices as by default."""
+    source = Gaussian(fwhm_x="8.9 cm", fwhm_y="6.3 cm")
+    twelve = response_matrix(GEOMETRY, SliceGrid.uniform(LENGTH, 12), Kolmogorov(), [source] * 2, sampling="midpoint")
+    spent = []
+    for _ in range(4):
+        begin = time.process_time()
+        retrieve(twelve, twelve @ np.full(12, CN2))
+        spent.append(time.process_time() - begin)
+    assert min(spent[1:]) < 0.1
