@@ -75,5 +75,5 @@ def flux_noise_variance(
     ndarray
         counts^2: the noise of `area` pixels, and one electron^2 per electron of light.
     """
-    photons = np.maximum(flux, 0.0) / gain if gain else 0.0
+    photons = np.maximum(flux, 0.0) / gain if gain else np.zeros_like(flux)
     return np.asarray(area * pixel_variance + photons)

@@ -143,7 +143,7 @@ def simulation_progress() -> Iterator[Callable[[str, int, int], None]]:
               help="Archive (X.zarr or X.zarr.zip), or a folder for the archives of a scenario.")  # fmt: skip
 @click.option("--duration", help="Length of each recording instead of the scenario's: '20 s'.")
 @click.option("--seed", type=int, help="Seed instead of the scenario's.")
-@click.option("--codec", type=click.Choice(["lz4", "zstd"]), default="lz4", show_default=True, help="Fast, or small.")
+@click.option("--codec", type=click.Choice(["lz4", "zstd"]), help="Fast, or small; instead of the scenario's.")
 @click.option("--force", is_flag=True, help="Replace archives that are there.")
 def simulate(scenario: str, output: Path, duration: str | None, seed: int | None, codec: Any, force: bool) -> None:
     """Make recordings whose truth is known, by first-order theory in spherical waves.

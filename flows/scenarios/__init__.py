@@ -1,1 +1,1 @@
-
+"""Scenarios shipped with the package."""

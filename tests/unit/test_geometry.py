@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+
 from coslidar.pipeline.geometry import MAP_KINDS, Geometry, SliceGrid
 
 SCINDAR = ((0, 1, 1, 1, 0), (1, 1, 1, 1, 1), (1, 1, 0, 1, 1), (1, 1, 1, 1, 1), (0, 1, 1, 1, 0))

@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 import numpy as np
 import pytest
+
 from coslidar.plugins import registry
 from coslidar.plugins.contract import RegulariserBase, SourceModelBase
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+
 from coslidar.flows.settings import InputError, load, overlay, plugin_text, with_plugin
 from coslidar.pipeline.parameters import Header
 
@@ -91,7 +92,9 @@ slices = 0
     assert (
         "campaign.toml: source.fwhm_x = '8,9 cm': use a point as decimal sign, not a comma; write '8.9 cm'"
     ) in found
-    assert "campaign.toml: batch.duration = 180: the unit is missing. batch.duration is a duration; write '180 s'" in found
+    assert (
+        "campaign.toml: batch.duration = 180: the unit is missing. batch.duration is a duration; write '180 s'" in found
+    )
     assert "campaign.toml: batch.lenght = '3 min': there is no such key; check its spelling" in found
     assert any(
         f.startswith("campaign.toml: regulariser.name = 'tvv': no regulariser 'tvv'; installed: ")
@@ -179,7 +182,9 @@ def test_source_extent_comes_from_the_header_unless_given(tmp_path: Path) -> Non
 
 def test_sources_at_infinity_are_angles() -> None:
     far = overlay(HEADER, {"path": {"length": "inf m"}})
-    far["sources"] = [{"name": "star", "position": ["0 rad", "0 rad"], "fwhm": ["2 arcsec", "2 arcsec"], "spot": [9, 9]}]
+    far["sources"] = [
+        {"name": "star", "position": ["0 rad", "0 rad"], "fwhm": ["2 arcsec", "2 arcsec"], "spot": [9, 9]}
+    ]
     (model,) = load().source_models(Header.model_validate(far), "a")
     assert model.fwhm_x == pytest.approx(2 * 4.84814e-6, rel=1e-5)  # type: ignore[attr-defined]
 

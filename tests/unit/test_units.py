@@ -3,11 +3,12 @@ from __future__ import annotations
 import math
 
 import pytest
-from coslidar.pipeline.parameters import Parameters
-from coslidar.pipeline.units import Extent, Length, PathLength, QuantityError, faults, parse, rounded, safe, text
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, ValidationError, create_model
+
+from coslidar.pipeline.parameters import Parameters
+from coslidar.pipeline.units import Extent, Length, PathLength, QuantityError, faults, parse, rounded, safe, text
 
 
 @pytest.mark.parametrize(
