@@ -1,12 +1,14 @@
 """Base classes of the four kinds of plugin.
 
 A plugin is a frozen model: its parameters are typed fields with units, its identity is its name, its integer
-`version` and its parameters. A subclass sets `name` and implements one method.
+`version` and its parameters. A subclass sets `name` and implements one method. What is promised here in words,
+:mod:`.conformance` checks by running it.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -28,12 +30,19 @@ class Plugin(BaseModel):
         Name in campaign files; equal to the name of the entry point.
     version : int
         Raise it whenever the same parameters give other numbers; it is part of the key of every product.
+    examples : tuple of mapping
+        Parameters, written as in a campaign file, with which `coslidar plugins check` tries the plugin beside its
+        defaults; at least one where a parameter has no default.
+    expected_failed_checks : mapping of str to str
+        Name of a check that the plugin fails on purpose, and the reason.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True, use_attribute_docstrings=True)
 
     name: ClassVar[str]
     version: ClassVar[int] = 1
+    examples: ClassVar[tuple[Mapping[str, Any], ...]] = ()
+    expected_failed_checks: ClassVar[Mapping[str, str]] = {}
 
     def identity(self) -> dict[str, Any]:
         """Name, version and parameters (SI floats): what enters the lineage."""
@@ -41,7 +50,7 @@ class Plugin(BaseModel):
 
 
 class SourceModelBase(Plugin):
-    """Intensity distribution of a source."""
+    """Intensity distribution of a source, normalised to 1, its centroid at the position that the header gives."""
 
     @abstractmethod
     def transfer(self, fx: NDArray[np.float64], fy: NDArray[np.float64]) -> NDArray[Any]:
@@ -117,6 +126,12 @@ class RegulariserBase(Plugin):
         -------
         ndarray of float, (k, k)
             Symmetric, positive semi-definite, without unit.
+
+        Raises
+        ------
+        ValueError
+            The parameters fit no such grid (a value for each of another number of slices); the message begins with
+            the name of the plugin.
         """
 
 
@@ -135,5 +150,5 @@ class HyperparameterSelectorBase(Plugin):
         Returns
         -------
         Selection
-            mu in m^(4/3), and the criterion curve it was chosen from.
+            mu in m^(4/3), and the criterion curve it was chosen from; its smallest value is the best.
         """

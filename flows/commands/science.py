@@ -18,7 +18,7 @@ _OUT = click.Path(dir_okay=False, path_type=Path)
 
 @click.group()
 def plugins() -> None:
-    """List and describe installed plugins."""
+    """List, describe and check installed plugins."""
 
 
 @plugins.command("ls")
@@ -67,6 +67,54 @@ def plugins_describe(name: str) -> None:
         click.echo(f'\nIn a campaign file:  [{keys[kind]}]  name = "{name}"')
     if not found:
         raise PluginError([f"no plugin '{name}'; 'coslidar plugins ls' lists them"])
+
+
+@plugins.command("check")
+@click.argument("distribution", metavar="DIST")
+def plugins_check(distribution: str) -> None:
+    """Run the contract on every plugin of the installed distribution DIST, a line per check.
+
+    Each is tried with its defaults and with the parameters of its class attribute `examples`. Exit codes: 1 where a
+    check fails, 2 where there is no such distribution.
+    """
+    from importlib.metadata import PackageNotFoundError
+    from importlib.metadata import distribution as installed
+
+    from ...pipeline.units import safe
+    from ...plugins.conformance import CheckResult, check_plugin
+    from ...plugins.registry import KINDS, Entry, PluginError
+    from ..settings import InputError
+
+    try:
+        found = installed(distribution)
+    except (PackageNotFoundError, ValueError) as error:
+        raise InputError(
+            [f"no distribution '{safe(distribution)}' is installed; 'coslidar plugins ls' names them"]
+        ) from error
+    title = f"{found.name} {found.version}"
+    groups = {group: kind for kind, (group, _) in KINDS.items()}
+    points = [point for point in found.entry_points if point.group in groups]
+    if not points:
+        raise InputError([f"{title} registers no plugin: it has no entry point of {', '.join(groups)}"])
+
+    colours = {"passed": None, "failed": "red", "exempt": "yellow"}
+    counts = dict.fromkeys(colours, 0)
+    for point in sorted(points, key=lambda point: (list(groups).index(point.group), point.name)):
+        entry = Entry(groups[point.group], point.name, title, point)
+        try:
+            results = check_plugin(entry.load())
+        except (PluginError, ValueError) as error:
+            results = [CheckResult(point.name, "loads", "failed", str(error))]
+        for result in results:
+            counts[result.status] += 1
+            line = f"{result.status:<7} {result.plugin:<24} {result.check:<20} {result.message}".rstrip()
+            click.secho("".join(c if c.isprintable() else " " for c in line), fg=colours[result.status])
+    click.echo(
+        f"{title}: {len(points)} plugin{'s' * (len(points) != 1)}, {counts['passed']} checks passed, "
+        f"{counts['failed']} failed, {counts['exempt']} exempt"
+    )
+    if counts["failed"]:
+        raise click.exceptions.Exit(1)
 
 
 def _header(archive: str | None, campaign: Path | None) -> tuple[Header, Settings, str]:
