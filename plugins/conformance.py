@@ -742,9 +742,10 @@ CHECKS: dict[str, tuple[Check, ...]] = {kind: (*_COMMON, *checks) for kind, chec
 def _can_be_built(cls: type[Plugin]) -> str | None:
     required = [name for name, info in cls.model_fields.items() if info.is_required()]
     if required and not cls.examples:
+        pattern = ", ".join(f'"{name}": "..."' for name in required)
         return (
             f"no example, though {', '.join(required)} {'has' if len(required) == 1 else 'have'} no default; write "
-            f'examples: ClassVar = ({{"{required[0]}": "..."}},)'
+            f"examples: ClassVar = ({{{pattern}}},)"
         )
     for example in cls.examples:
         try:
