@@ -25,6 +25,7 @@ COMMANDS = {
     "plugins": ("science", "List and describe installed plugins."),
     "response": ("science", "Compute the response matrix M of an instrument."),
     "invert": ("science", "Invert correlation data of your own with a response matrix."),
+    "experiment": ("experiment", "Try priors, selectors and error bars on data whose truth is known."),
 }
 
 
