@@ -203,7 +203,7 @@ def test_all_zero_frames_are_stored(tmp_path: Path) -> None:
             ),
         },
     ],
-    ids=str,
+    ids=lambda layout: "-".join(layout),
 )
 @pytest.mark.parametrize("zipped", [False, True], ids=["folder", "zip"])
 def test_every_layout_that_the_format_allows_is_read(tmp_path: Path, layout: dict[str, Any], zipped: bool) -> None:
