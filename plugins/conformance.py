@@ -434,7 +434,7 @@ def _transfer_at_zero(plugin: SourceModelBase) -> str | None:
     return None if abs(found - 1) <= 1e-9 else f"transfer(0, 0) = {found:.12g}"
 
 
-@_check("|transfer| exceeds 1 nowhere, up to infinity, as no intensity is negative", _SOURCE)
+@_check("the modulus of transfer exceeds 1 nowhere, up to infinity, as no intensity is negative", _SOURCE)
 def _transfer_bounded(plugin: SourceModelBase) -> str | None:
     scales, near = _all_scales(), _frequencies(plugin, 25)
     fx, fy = (np.concatenate([one.ravel(), other.ravel()]) for one, other in zip(scales, near, strict=True))
