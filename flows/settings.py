@@ -37,6 +37,23 @@ DEFAULT_PLUGINS = {
     "regulariser": {"name": "white"},
     "selector": {"name": "gcv"},
 }
+#: Settings that `preset = "NAME"` in a campaign file stands for; what the file says beside it wins.
+PRESETS: dict[str, dict[str, Any]] = {
+    # Sauvage et al. 2021, arXiv:2111.08003. The paper takes the response at a distance z_i for each slice without
+    # saying which, and subtracts the variance of the vibration, found in the slopes' temporal spectrum, from all
+    # entries of the slope maps; the constant that is estimated here takes its place.
+    "sauvage-2021": {
+        "batch": {"duration": "3 min"},
+        "extraction": {"method": "moving_maximum"},
+        "correlation": {"covariance": "independent"},
+        "response": {"slices": 12, "sampling": "midpoint", "slope_response": "printed"},
+        "inversion": {"estimator": "map", "subset": "all", "noise_bias": "joint", "slope_offset": "joint"},
+        "source": {"name": "gaussian"},
+        "spectrum": {"name": "kolmogorov"},
+        "regulariser": {"name": "white"},
+        "selector": {"name": "gcv", "log_mu_min": 25.0, "log_mu_max": 33.0, "log_mu_step": 0.5},
+    }
+}
 #: Tables of a campaign file that replace or complete keys of the archives' headers.
 HEADER_TABLES = ("site", "instrument", "path", "sources")
 _URL = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+://")
@@ -283,6 +300,7 @@ def load(
         except InputError as error:
             faults += error.faults
 
+    table = _with_preset(table, origin, faults)
     name = table.pop("campaign", None)
     if name is not None:
         try:
@@ -336,6 +354,19 @@ def load(
         header=header,
         run=run,
     )
+
+
+def _with_preset(table: dict[str, Any], origin: str, faults: list[str]) -> dict[str, Any]:
+    """The settings of a campaign file over those of the preset that it names."""
+    table = dict(table)
+    name = table.pop("preset", None)
+    if name is None:
+        return table
+    if not isinstance(name, str) or name not in PRESETS:
+        faults.append(f"{origin}: preset = {name!r}: there is no such preset; known: {', '.join(PRESETS)}")
+        return table
+    # Parameters of one plugin mean nothing to another: a plugin that the file names replaces that of the preset.
+    return overlay({key: value for key, value in PRESETS[name].items() if key not in KEYS or key not in table}, table)
 
 
 def replace_run(run: RunParameters, scheduler: str) -> RunParameters:

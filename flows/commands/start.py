@@ -17,6 +17,7 @@ _CAMPAIGN = """\
 
 {campaign}archives = {archives}
 output = "results"                  # folder of the catalog and its products
+# preset = "sauvage-2021"           # settings of the published campaign, under all that this file says
 
 [batch]
 duration = "{duration}"             # averaging window of one profile

@@ -2,9 +2,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from coslidar.flows.settings import InputError, load, overlay, plugin_text, with_plugin
+from coslidar.pipeline.geometry import SliceGrid
 from coslidar.pipeline.parameters import Header
 
 GOOD = """
@@ -193,3 +195,48 @@ def test_campaign_tables_lie_on_top_of_headers() -> None:
     settings = load(assignments=["path.length=3 km"])
     assert settings.effective_header(HEADER, "a").path.length == 3000
     assert settings.header == {"path": {"length": "3 km"}}
+
+
+def test_preset_of_the_paper(tmp_path: Path) -> None:
+    """Sauvage et al. 2021: moving window, printed slopes, independent frames, white prior, GCV from log mu 25, MAP."""
+    settings = load(write(tmp_path, 'preset = "sauvage-2021"'))
+    configuration = settings.configuration
+    assert configuration.batch.duration == 180
+    assert configuration.extraction.method == "moving_maximum"
+    assert configuration.correlation.covariance == "independent"
+    assert configuration.response.slope_response == "printed"
+    assert configuration.response.slices == 12
+    assert configuration.inversion.estimator == "map"
+    assert configuration.inversion.noise_bias == "joint"
+    np.testing.assert_array_equal(settings.regulariser().precision(SliceGrid.uniform(100, 3)), np.eye(3))
+    selector = settings.selector()
+    assert selector.name == "gcv"
+    np.testing.assert_array_equal(selector.log_mu, np.arange(25, 33.25, 0.5))
+
+
+def test_a_file_wins_over_its_preset(tmp_path: Path) -> None:
+    text = """
+preset = "sauvage-2021"
+selector = "upre"
+[response]
+sampling = "mean"
+[inversion]
+slope_offset = "none"
+"""
+    settings = load(write(tmp_path, text), assignments=["response.slices=8"])
+    assert settings.configuration.response.sampling == "mean"
+    assert settings.configuration.response.slices == 8
+    assert settings.configuration.response.slope_response == "printed"
+    assert settings.configuration.inversion.slope_offset == "none"
+    assert settings.plugins["selector"] == {"name": "upre"}
+
+
+def test_preset_from_the_command_line() -> None:
+    settings = load(assignments=["preset=sauvage-2021"])
+    assert settings.configuration.correlation.covariance == "independent"
+
+
+def test_unknown_preset_is_named(tmp_path: Path) -> None:
+    assert faults(tmp_path, 'preset = "sauvage"') == [
+        "campaign.toml: preset = 'sauvage': there is no such preset; known: sauvage-2021"
+    ]
