@@ -365,8 +365,15 @@ def _with_preset(table: dict[str, Any], origin: str, faults: list[str]) -> dict[
     if not isinstance(name, str) or name not in PRESETS:
         faults.append(f"{origin}: preset = {name!r}: there is no such preset; known: {', '.join(PRESETS)}")
         return table
-    # Parameters of one plugin mean nothing to another: a plugin that the file names replaces that of the preset.
-    return overlay({key: value for key, value in PRESETS[name].items() if key not in KEYS or key not in table}, table)
+    below = {**PRESETS[name]}
+    for key in KEYS.keys() & below.keys() & table.keys():
+        given = table[key]
+        if isinstance(given, str) and given.partition("=")[0].partition(":")[0].strip() == below[key]["name"]:
+            table[key] = given = plugin_text(given)
+        if not isinstance(given, dict) or given.get("name", below[key]["name"]) != below[key]["name"]:
+            # Parameters of one plugin mean nothing to another.
+            del below[key]
+    return overlay(below, table)
 
 
 def replace_run(run: RunParameters, scheduler: str) -> RunParameters:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -229,6 +230,19 @@ slope_offset = "none"
     assert settings.configuration.response.slope_response == "printed"
     assert settings.configuration.inversion.slope_offset == "none"
     assert settings.plugins["selector"] == {"name": "upre"}
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ('selector = "gcv"', {"name": "gcv", "log_mu_min": 25.0, "log_mu_max": 33.0, "log_mu_step": 0.5}),
+        ('selector = "gcv:log_mu_step=1"', {"name": "gcv", "log_mu_min": 25.0, "log_mu_max": 33.0, "log_mu_step": 1}),
+        ("selector = {log_mu_min = 24}", {"name": "gcv", "log_mu_min": 24, "log_mu_max": 33.0, "log_mu_step": 0.5}),
+        ('selector = {name = "upre", log_mu_min = 24}', {"name": "upre", "log_mu_min": 24}),
+    ],
+)
+def test_plugin_of_a_preset_keeps_what_is_not_said_anew(tmp_path: Path, given: str, expected: dict[str, Any]) -> None:
+    assert load(write(tmp_path, f'preset = "sauvage-2021"\n{given}')).plugins["selector"] == expected
 
 
 def test_preset_from_the_command_line() -> None:
