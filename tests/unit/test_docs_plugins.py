@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from coslidar.pipeline import units
+from coslidar.pipeline import lineage, units
 from coslidar.plugins import conformance, registry
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -68,8 +68,9 @@ def test_the_page_works_from_an_empty_folder(tmp_path: Path) -> None:
         if "No matching distribution found for setuptools" in done.stderr:
             pytest.skip("pip finds no package index to take setuptools from, and setuptools>=70.1 is not installed")
         assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
-        return done.stdout
+        return done.stdout + (done.stderr if "coslidar run" in commands else "")
 
+    code = lineage.checkout.__wrapped__()
     said = []
     for kind, body in BLOCKS:
         if kind == "sh":
@@ -85,6 +86,10 @@ def test_the_page_works_from_an_empty_folder(tmp_path: Path) -> None:
     assert re.search(r"^\d+ passed in", tested.strip().splitlines()[-1])
     assert "1 products in my-campaign/results" in first
     assert "2 products in my-campaign/results" in second
+    assert " 1420 frames read" in first
+    # An uncommitted change of the code is part of every key: edits made while this runs leave nothing to reuse.
+    if lineage.checkout.__wrapped__().mark == code.mark:
+        assert " 0 frames read" in second
     shown = json.loads(shell("coslidar catalog show uniform --out my-campaign/results --json"))
     lineage = json.dumps(shown["attributes"]["lineage"])
     assert '"calm_far_away"' in lineage
