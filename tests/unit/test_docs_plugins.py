@@ -91,9 +91,9 @@ def test_the_page_works_from_an_empty_folder(tmp_path: Path) -> None:
     if lineage.checkout.__wrapped__().mark == code.mark:
         assert " 0 frames read" in second
     shown = json.loads(shell("coslidar catalog show uniform --out my-campaign/results --json"))
-    lineage = json.dumps(shown["attributes"]["lineage"])
-    assert '"calm_far_away"' in lineage
-    assert '"length": 2000' in lineage
+    made_of = json.dumps(shown["attributes"]["lineage"])
+    assert '"calm_far_away"' in made_of
+    assert '"length": 2000' in made_of
     assert max(shown["cn2"][0]) > 0
 
 
