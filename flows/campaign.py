@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
-from prefect.states import Completed, Failed, State
+from prefect.client.schemas.objects import State
+from prefect.exceptions import TerminationSignal
+from prefect.states import Completed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.utilities.annotations import unmapped
 
@@ -21,8 +23,6 @@ from .settings import Settings, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from .driver import Progress
 
 
 @task(name="archive", task_run_name="{url}", cache_policy=NO_CACHE, persist_result=False)
@@ -37,8 +37,20 @@ def archive_task(url: str, work: Work) -> State[ArchiveOutcome]:
 
 def in_tasks(process: Callable[[str, Work], ArchiveOutcome], archives: list[str], work: Work) -> list[ArchiveOutcome]:
     """Fan out archives as Prefect tasks."""
-    states = archive_task.map(archives, work=unmapped(work), return_state=True)
-    return [state.result(raise_on_failure=False) for state in states]
+    try:
+        futures = archive_task.map(archives, work=unmapped(work))
+        outcomes: list[ArchiveOutcome] = []
+        for future in futures:
+            future.wait()
+            outcome = future.state.result(raise_on_failure=False)
+            if isinstance(outcome, BaseException):
+                raise outcome
+            outcomes.append(outcome)
+    except BaseException:
+        # Prefect waits for its tasks before anybody else hears of this.
+        work.stopping.set()
+        raise
+    return outcomes
 
 
 def processing_flow(settings: Settings, work: Work) -> list[ArchiveOutcome]:
@@ -66,7 +78,11 @@ def processing_flow(settings: Settings, work: Work) -> list[ArchiveOutcome]:
     def campaign() -> list[ArchiveOutcome]:
         return execute(work, settings.archives, in_tasks)
 
-    return campaign()
+    try:
+        return campaign()
+    except TerminationSignal as error:
+        # Prefect's name for SIGTERM while a flow runs.
+        raise KeyboardInterrupt from error
 
 
 @flow(name="reprocess", persist_result=False)
@@ -91,9 +107,3 @@ def reprocess(campaign_file: str, output: str | None = None, assignments: list[s
     with session(settings) as work:
         outcomes = execute(work, settings.archives, in_tasks)
     return sum(outcome.status in ("refused", "failed") for outcome in outcomes)
-
-
-def run_with_prefect(settings: Settings, progress: Progress) -> list[ArchiveOutcome]:
-    """Process a campaign as a Prefect flow, on the server of PREFECT_API_URL or our own."""
-    with session(settings, progress) as work:
-        return processing_flow(settings, work)

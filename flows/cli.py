@@ -29,8 +29,19 @@ COMMANDS = {
 }
 
 
+class Interrupted(BaseException):
+    """SIGINT or SIGTERM."""
+
+
 class Commands(click.Group):
     """Commands that are imported only when they are called."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; an interrupt is told by :func:`main`, in one line."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise Interrupted from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """In the order of use."""
@@ -74,6 +85,9 @@ def complain(faults: Sequence[str]) -> None:
 
 
 def _stop(signum: int, frame: Any) -> NoReturn:
+    # Once is a request, twice an order.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(130))
     raise KeyboardInterrupt
 
 
@@ -82,7 +96,9 @@ def main() -> None:
     # One thread for each numerical library, before any is imported: the batches are what runs in parallel.
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
-    signal.signal(signal.SIGTERM, _stop)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup and shells in the background want it
+            signal.signal(number, _stop)
     try:
         sys.exit(cli.main(standalone_mode=False) or 0)
     except click.exceptions.Exit as leave:
@@ -90,9 +106,12 @@ def main() -> None:
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (KeyboardInterrupt, click.Abort):
+    except (Interrupted, KeyboardInterrupt, click.Abort):
+        if sys.stderr.isatty():
+            click.echo(err=True)  # the terminal has written ^C into this line
         complain(["interrupted; what was finished is kept, the same command goes on from there"])
-        sys.exit(130)
+        # All is closed; threads of libraries are not worth waiting for.
+        os._exit(130)
     except BrokenPipeError:
         # The reader of our output (head, less) has gone; that is its good right.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -105,7 +124,11 @@ def main() -> None:
         if os.environ.get("COSLIDAR_DEBUG"):
             raise
         from ..pipeline.units import safe
+        from .settings import Unavailable
 
+        if isinstance(error, Unavailable):
+            complain([safe(str(error))])
+            sys.exit(1)
         complain(
             [
                 f"{type(error).__name__}: {safe(str(error))}",

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import os
+import warnings
 from collections import OrderedDict
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from socket import gethostname
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +18,7 @@ import numpy as np
 from ..catalog.archive import ArchiveError, ChunkError, open_archive
 from ..pipeline import batch as stages
 from ..pipeline.extraction import Calibration
+from .settings import Unavailable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -29,8 +32,10 @@ if TYPE_CHECKING:
     from .plan import BatchWindow
     from .settings import RunParameters
 
-#: A worker that has been lost this often to one batch takes that batch for poison.
+#: A batch that has been lost with its worker more often than this is taken for poison.
 ALLOWED_FAILURES = 3
+#: How long a cluster may take to answer, and to have its first worker, s.
+PATIENCE = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +54,8 @@ class BatchTask:
         Requested length of a batch, s.
     extraction, correlation
         Parameters of the stages.
+    complete : dict
+        Tables of the campaign on top of the archive's header.
     reduced : ReducedBatch or None
         Correlations that are already there; no frame is read then.
     """
@@ -60,6 +67,7 @@ class BatchTask:
     duration: float
     extraction: ExtractionParameters
     correlation: CorrelationParameters
+    complete: dict[str, Any]
     reduced: ReducedBatch | None = None
 
 
@@ -79,6 +87,9 @@ class BatchOutcome:
         Frames that were read for it.
     transient : bool
         Whether it failed for a reason in the machine, so that another try may succeed.
+    lasting : bool
+        Whether the same archive gives the same result again. A damaged chunk may be mended, and the archive keeps
+        its identity then.
     """
 
     window: BatchWindow
@@ -86,30 +97,42 @@ class BatchOutcome:
     reduced: ReducedBatch | None
     frames_read: int
     transient: bool = False
+    lasting: bool = True
 
 
+class ArchiveChanged(RuntimeError):
+    """An archive is not what it was when the run was planned."""
+
+
+#: Archives that a worker keeps open.
+MAX_OPEN = 8
 _open: OrderedDict[str, Archive] = OrderedDict()
 _open_lock = Lock()
 
 
-def _archive(url: str, identity: str) -> Archive:
+def _archive(url: str, identity: str, complete: dict[str, Any]) -> Archive:
     """The archive, opened once per process and checked to be the one that was planned."""
     with _open_lock:
         archive = _open.get(identity)
         if archive is None:
-            archive = open_archive(url)
+            # As the plan opened it: what is missing spoils its batch only.
+            archive = open_archive(url, complete=complete, allow_missing=True)
             if archive.identity != identity:
-                raise stages.BatchError(f"{url} has changed since the run was planned; start the run again")
-            _open[identity] = archive
-            while len(_open) > 8:
-                _open.popitem(last=False)
+                raise ArchiveChanged(f"{url} has changed since the run was planned; start the run again")
+            _keep_open(archive)
     return archive
+
+
+def _keep_open(archive: Archive) -> None:
+    _open[archive.identity] = archive
+    while len(_open) > MAX_OPEN:
+        _open.popitem(last=False)
 
 
 def remember(archive: Archive) -> None:
     """Let the workers of this process use an archive that is open already."""
     with _open_lock:
-        _open[archive.identity] = archive
+        _keep_open(archive)
 
 
 def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
@@ -118,9 +141,10 @@ def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
     What the data forbid becomes a failed result with its reason; anything else is raised.
     """
     reduced, new, window = task.reduced, None, task.window
+    lasting = True
     try:
         if reduced is None:
-            archive = _archive(task.url, task.identity)
+            archive = _archive(task.url, task.identity, task.complete)
             calibration = Calibration(
                 dark=archive.dark,
                 flat=archive.flat,
@@ -142,9 +166,14 @@ def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
                 task.correlation,
             )
         result = stages.retrieve(reduced, model)
-    except (stages.BatchError, ChunkError, ArchiveError) as error:
+    except ArchiveError as error:
+        # The driver could open it.
+        raise RuntimeError(f"the worker on {gethostname()} cannot open the archive: {error}") from error
+    except (stages.BatchError, ChunkError) as error:
+        lasting = isinstance(error, stages.BatchError)
         result = stages.failed(window.start_time, window.stop_time, str(error))
-    return BatchOutcome(window, result, new, 0 if task.reduced is not None else window.stop - window.start)
+    read = 0 if task.reduced is not None else window.stop - window.start
+    return BatchOutcome(window, result, new, read, lasting=lasting)
 
 
 def _settings() -> dict[str, Any]:
@@ -153,6 +182,11 @@ def _settings() -> dict[str, Any]:
         "distributed.admin.tick.limit": "60s",
         "distributed.worker.memory.terminate": 0.95,
     }
+
+
+def _cores() -> int:
+    # Not every core may be ours; macOS does not tell.
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @contextmanager
@@ -170,16 +204,17 @@ def connect(run: RunParameters) -> Iterator[Client]:
 
     Raises
     ------
-    ConnectionError
-        No scheduler answers, or its workers run other versions.
+    Unavailable
+        No scheduler answers, it has no worker, or its workers run other versions.
     """
     import dask
     from distributed import Client
+    from distributed.versions import VersionMismatchWarning
 
     # Prefect gives every logger a handler; what went wrong in a batch is told once, by the driver.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
-    threads = run.threads or len(os.sched_getaffinity(0))
+    threads = run.threads or _cores()
     with dask.config.set(_settings()):
         if run.scheduler is None:
             client = Client(
@@ -192,51 +227,76 @@ def connect(run: RunParameters) -> Iterator[Client]:
                 worker_dashboard_address="127.0.0.1:0",
             )
         else:
-            address: dict[str, Any] = (
-                {"scheduler_file": run.scheduler} if Path(run.scheduler).is_file() else {"address": run.scheduler}
-            )
+            is_file = Path(run.scheduler).is_file()
             try:
-                client = Client(**address, timeout="20s", set_as_default=False)
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", VersionMismatchWarning)  # we refuse, and say more
+                    client = Client(
+                        address=None if is_file else run.scheduler,
+                        scheduler_file=run.scheduler if is_file else None,
+                        timeout=PATIENCE,
+                        set_as_default=False,
+                    )
             except (OSError, ValueError, TimeoutError) as error:
-                raise ConnectionError(
+                raise Unavailable(
                     f"no Dask scheduler answers at {run.scheduler} ({type(error).__name__}: {error}); start one with "
                     "'dask scheduler', or leave --scheduler out to compute on this machine"
                 ) from error
         try:
             if run.scheduler is not None:
-                _same_versions(client)
+                check_workers(client, run.scheduler)
             yield client
         finally:
             client.close()
 
 
-def _same_versions(client: Client) -> None:
-    """Refuse a cluster whose packages differ from ours: numbers would depend on where a batch ran."""
-    import importlib.metadata as metadata
+def _versions() -> dict[str, str]:
+    import platform
+    from importlib.metadata import version
 
     names = ("coslidar", "numpy", "scipy", "numba", "zarr", "numcodecs", "dask", "distributed")
+    return {"python": platform.python_version(), **{name: version(name) for name in names}}
 
-    def versions() -> dict[str, str]:
-        return {name: metadata.version(name) for name in names}
 
-    mine = versions()
+def check_workers(client: Client, address: str) -> None:
+    """Refuse a cluster without workers, or with other packages than ours: numbers would depend on where a batch ran.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Connected to a cluster of somebody else.
+    address : str
+        What the user calls it.
+
+    Raises
+    ------
+    Unavailable
+        No worker comes, or its versions differ.
+    """
     try:
-        theirs = client.run(versions)
+        client.wait_for_workers(1, timeout=PATIENCE)
+    except TimeoutError as error:
+        raise Unavailable(
+            f"the Dask scheduler at {address} has no worker; start some with 'dask worker {client.scheduler.address}'"
+        ) from error
+    mine = _versions()
+    try:
+        theirs = client.run(_versions)
     except Exception as error:
-        raise ConnectionError(
-            f"the workers of {client.scheduler.address} cannot run coslidar ({type(error).__name__}: {error}); "
+        raise Unavailable(
+            f"the workers of {address} cannot run coslidar ({type(error).__name__}: {error}); "
             "install the same environment on every worker"
         ) from error
     wrong = sorted(
         {
-            f"{name} is {found[name]} on worker {worker} and {mine[name]} here"
+            f"{name} is {found.get(name)} on worker {worker} and {mine[name]} here"
             for worker, found in theirs.items()
-            for name in names
-            if found[name] != mine[name]
+            for name in mine
+            if found.get(name) != mine[name]
         }
     )
     if wrong:
-        raise ConnectionError(f"versions differ: {'; '.join(wrong)}; install the same environment everywhere")
+        raise Unavailable(f"versions differ: {'; '.join(wrong)}; install the same environment everywhere")
 
 
 def as_stored(reduced: ReducedBatch) -> dict[str, np.ndarray[Any, Any]]:

@@ -248,7 +248,12 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     faults = tuple(
         f"{plan.name}: batch {number}: {result.reason}" for number, result in enumerate(results) if result.reason
     )
-    counts = {"batches": len(results), "failed_batches": len(faults), "reused": reused, "frames_read": frames_read}
+    counts: dict[str, Any] = {
+        "batches": len(results),
+        "failed_batches": len(faults),
+        "reused": reused,
+        "frames_read": frames_read,
+    }
     if len(faults) == len(results) or transient:
         # What the machine spoiled may succeed next time; what the data forbid never will.
         return ArchiveOutcome(plan.url, plan.name, "failed", faults=faults, input_fault=not transient, **counts)
@@ -334,6 +339,7 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
             duration=settings.configuration.batch.duration,
             extraction=settings.configuration.extraction,
             correlation=settings.configuration.correlation,
+            complete=settings.header,
             reduced=from_stored(stored) if stored else None,
         )
         future = client.submit(process_batch, task, model, pure=False, key=f"{plan.name}-{window.index}-{id(task):x}")
@@ -364,17 +370,18 @@ def _outcome(future: Future, window: BatchWindow, plan: ArchivePlan) -> BatchOut
     from distributed import KilledWorker
 
     try:
-        result: BatchOutcome = future.result()
-        return result
+        outcome: BatchOutcome = future.result()
+        return outcome
     except KilledWorker:
-        reason = f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
+        reason = (
+            f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
+        )
     except CancelledError:
         reason = "the Dask scheduler was lost"
     except Exception as error:
         log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
         reason = f"{type(error).__name__}: {safe(str(error))}"
-    result = BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0, transient=True)
-    return result
+    return BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0, transient=True)
 
 
 def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[ArchiveOutcome]]) -> list[ArchiveOutcome]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from threading import Lock
 from typing import TYPE_CHECKING
 
@@ -19,17 +19,29 @@ if TYPE_CHECKING:
     from .driver import ArchiveOutcome, Progress
 
 
+def say(line: str) -> None:
+    """One line on stderr. Whoever read it may have gone (``2>&1 | head``), which is no reason to lose a run."""
+    with suppress(OSError, ValueError):
+        click.echo(f"coslidar: {line}", err=True)
+
+
+def counted(number: int, what: str) -> str:
+    """Number and noun: ``1 batch``, ``2 batches``."""
+    plural = "es" if what.endswith(("ch", "s")) else "s"
+    return f"{number} {what}{'' if number == 1 else plural}"
+
+
 def _sentence(outcome: ArchiveOutcome) -> str:
+    words = outcome.status
     if outcome.status == "published":
-        words = f"{outcome.batches} batches published"
+        words = f"{counted(outcome.batches - outcome.failed_batches, 'batch')} published"
         if outcome.reused:
-            words += f", {outcome.reused} of them found finished"
-        if outcome.failed_batches:
-            words += f", {outcome.failed_batches} failed"
-        return words
-    if outcome.status == "present":
-        return f"{outcome.batches} batches, already in the catalog"
-    return outcome.status
+            words += f", {outcome.reused} computed earlier"
+    elif outcome.status == "present":
+        words = f"{counted(outcome.batches - outcome.failed_batches, 'batch')}, in the catalog already"
+    if outcome.failed_batches:
+        words += f", {outcome.failed_batches} of {outcome.batches} failed"
+    return words
 
 
 class Lines:
@@ -37,7 +49,7 @@ class Lines:
 
     def __init__(self, total: int) -> None:
         self.total = total
-        self.done = 0
+        self.outcomes: list[ArchiveOutcome] = []
         self._told: set[str] = set()
         self._lock = Lock()
 
@@ -52,16 +64,21 @@ class Lines:
     def _say(self, fault: str) -> None:
         if fault not in self._told:
             self._told.add(fault)
-            click.echo(f"coslidar: {fault}", err=True)
+            say(fault)
 
     def finished(self, outcome: ArchiveOutcome) -> None:
         """Say what became of an archive."""
         with self._lock:
-            self.done += 1
-            click.echo(f"coslidar: [{self.done}/{self.total}] {outcome.name}: {_sentence(outcome)}", err=True)
-            if outcome.status in ("refused", "failed"):
-                for fault in outcome.faults:
-                    self._say(fault)
+            self.outcomes.append(outcome)
+            say(f"[{len(self.outcomes)}/{self.total}] {outcome.name}: {_sentence(outcome)}")
+            for fault in outcome.faults:
+                self._say(fault)
+
+    def summary(self) -> str:
+        """What the run did, in one line."""
+        computed = sum(o.batches - o.reused for o in self.outcomes if o.status in ("published", "failed"))
+        frames = sum(outcome.frames_read for outcome in self.outcomes)
+        return f"{counted(computed, 'batch')} computed, {counted(frames, 'frame')} read"
 
 
 class Bar(Lines):
@@ -75,19 +92,24 @@ class Bar(Lines):
 
     def planned(self, archive: str, batches: int) -> None:
         """Show a bar."""
+        self._remove(archive)  # the same recording under another path
         self._tasks[archive] = self._bars.add_task(archive, total=batches)
 
     def advanced(self, archive: str, index: int, reason: str) -> None:
         """Move it."""
         super().advanced(archive, index, reason)
-        self._bars.advance(self._tasks[archive])
+        if (task := self._tasks.get(archive)) is not None:
+            self._bars.advance(task)
 
     def finished(self, outcome: ArchiveOutcome) -> None:
         """Take it away again."""
-        if (task := self._tasks.pop(outcome.name, None)) is not None:
-            self._bars.remove_task(task)
+        self._remove(outcome.name)
         self._bars.advance(self._run)
         super().finished(outcome)
+
+    def _remove(self, archive: str) -> None:
+        if (task := self._tasks.pop(archive, None)) is not None:
+            self._bars.remove_task(task)
 
 
 @contextmanager
@@ -105,8 +127,9 @@ def progress(total: int, quiet: bool = False) -> Iterator[Progress]:
     if quiet:
         yield _Faults(total)
         return
+    watcher: Lines
     if not sys.stderr.isatty():
-        yield Lines(total)
+        yield (watcher := Lines(total))
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -120,8 +143,8 @@ def progress(total: int, quiet: bool = False) -> Iterator[Progress]:
             TimeRemainingColumn(),
         )
         with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
-            yield Bar(total, bars)
-    click.echo(f"coslidar: {time.monotonic() - begin:.1f} s", err=True)
+            yield (watcher := Bar(total, bars))
+    say(f"{watcher.summary()}, {time.monotonic() - begin:.1f} s")
 
 
 class _Faults(Lines):
@@ -129,5 +152,5 @@ class _Faults(Lines):
 
     def finished(self, outcome: ArchiveOutcome) -> None:
         """Speak of failures."""
-        if outcome.status in ("refused", "failed"):
-            super().finished(outcome)
+        for fault in outcome.faults:
+            self._say(fault)

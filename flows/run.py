@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
 from .cluster import connect
 from .driver import ArchiveOutcome, Progress, Work, execute, in_threads
+from .settings import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -54,12 +55,30 @@ def session(settings: Settings, progress: Progress | None = None) -> Iterator[Wo
     Yields
     ------
     Work
-    """
-    from ..catalog.store import Catalog
 
-    with connect(settings.run) as client, Catalog(settings.output) as catalog:
-        run = catalog.start_run(described(settings))
-        yield Work(settings, catalog, run, client, progress or Silent())
+    Raises
+    ------
+    InputError
+        The catalog cannot be used.
+    Unavailable
+        The cluster cannot be used.
+    """
+    from ..catalog.database import DatabaseError
+    from ..catalog.store import Catalog, CatalogError
+
+    try:
+        opened = Catalog(settings.output)
+    except (CatalogError, DatabaseError) as error:
+        raise InputError([str(error)]) from error
+    with opened as catalog, connect(settings.run) as client:
+        work = Work(settings, catalog, catalog.start_run(described(settings)), client, progress or Silent())
+        try:
+            yield work
+        except BaseException as error:
+            work.stopping.set()
+            with suppress(Exception):  # the catalog may be what failed
+                catalog.finish_run(work.run, "failed" if isinstance(error, Exception) else "cancelled")
+            raise
 
 
 def run(settings: Settings, progress: Progress | None = None, *, prefect: bool = True) -> list[ArchiveOutcome]:
@@ -78,13 +97,22 @@ def run(settings: Settings, progress: Progress | None = None, *, prefect: bool =
     -------
     list of ArchiveOutcome
         In the order of the archives.
+
+    Raises
+    ------
+    InputError
+        The catalog cannot be used.
+    Unavailable
+        The cluster or the Prefect server cannot be used.
     """
-    if prefect:
-        from .server import server
+    if not prefect:
+        with session(settings, progress) as work:
+            return execute(work, settings.archives, in_threads)
+    from .server import server
 
-        with server():
-            from .campaign import run_with_prefect
+    # The server starts while catalog and workers do.
+    with server() as ready, session(settings, progress) as work:
+        ready()
+        from .campaign import processing_flow
 
-            return run_with_prefect(settings, progress or Silent())
-    with session(settings, progress) as work:
-        return execute(work, settings.archives, in_threads)
+        return processing_flow(settings, work)

@@ -77,6 +77,10 @@ class InputError(ValueError):
         return (type(self), (self.faults,))
 
 
+class Unavailable(RuntimeError):
+    """Something that a run needs does not answer: a scheduler, a server. The program says so and exits with 1."""
+
+
 class RunParameters(Parameters):
     """Where a campaign is computed; never part of a key."""
 
