@@ -6,6 +6,7 @@ slopes and fluxes), `reduce` (to correlation maps and their noise), `retrieve` (
 
 from __future__ import annotations
 
+import contextlib
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +18,7 @@ from .geometry import MAP_KINDS
 from .products import INTENSITY_KINDS, QUALITY_FLAGS, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -247,7 +248,24 @@ def reduce(
     )
 
 
-def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
+def _known(reduced: ReducedBatch, model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Data vector and precision of the prior."""
+    return correlation.data_vector(reduced.arrays["maps"]), model.regulariser.precision(model.grid)
+
+
+def _whitened(reduced: ReducedBatch, model: Model) -> inversion.Reduction:
+    return inversion.prepare(
+        correlation.data_vector(reduced.arrays["maps"]),
+        reduced.arrays["noise_covariance"],
+        model.matrix,
+        rows=model.geometry.independent,
+        subset=model.inversion.subset,
+        noise_bias=model.inversion.noise_bias == "joint",
+        slope_offset=model.inversion.slope_offset == "joint",
+    )
+
+
+def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBatch] = ()) -> BatchResult:
     """Profile of a batch, its uncertainty, and what follows from it.
 
     Parameters
@@ -256,6 +274,8 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
         Result of :func:`reduce`.
     model : Model
         Response and plugins.
+    neighbours : sequence of ReducedBatch
+        Batches before and after it, for selectors that choose mu from several.
 
     Returns
     -------
@@ -267,20 +287,19 @@ def retrieve(reduced: ReducedBatch, model: Model) -> BatchResult:
         The data admit no inversion.
     """
     geometry, grid, arrays = model.geometry, model.grid, reduced.arrays
-    data = correlation.data_vector(arrays["maps"])
+    around = []
+    for other in neighbours:
+        # A neighbour that cannot be inverted says nothing about mu; it fails on its own account.
+        with contextlib.suppress(ValueError, np.linalg.LinAlgError):
+            around.append(_whitened(other, model).problem(*_known(other, model), grid=grid))
     try:
-        profile = inversion.invert(
-            data,
-            arrays["noise_covariance"],
-            model.matrix,
+        profile = inversion.estimate(
+            _whitened(reduced, model),
+            *_known(reduced, model),
+            model.selector,
             grid=grid,
-            regulariser=model.regulariser,
-            selector=model.selector,
-            rows=geometry.independent,
-            subset=model.inversion.subset,
+            neighbours=around,
             estimator=model.inversion.estimator,
-            noise_bias=model.inversion.noise_bias == "joint",
-            slope_offset=model.inversion.slope_offset == "joint",
             # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
             seed=reduced.start // 1_000_000 % 2**31,
         )

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -55,10 +55,11 @@ TRUTHS: dict[str, tuple[float, ...]] = {
     "weak": (1.2e-14, 1e-14, 6e-15, 4e-15, 6e-15, 8e-15, 8e-15, 5e-15, 4e-15, 6e-15, 1.2e-14, 1.5e-14),
     "bright-last": (8e-15,) * 11 + (3e-13,),
     "empty": (0.0,) * 12,
+    "rough": (3.9e-15, 2.6e-15, 2.8e-14, 3.8e-15, 1.2e-13, 5.9e-14, 1e-15, 3e-14, 3.8e-15, 2.1e-14, 2.1e-14, 1e-15),
     "single": (0.0,) * 4 + (1e-13,) + (0.0,) * 7,
 }
-"""Cn2 of twelve slices, m^(-2/3): an afternoon as at 14:15 in Sauvage et al. 2021, its end, and three profiles that
-no prior expects."""
+"""Cn2 of twelve slices, m^(-2/3): an afternoon as at 14:15 in Sauvage et al. 2021, its end, a bright slice at the
+sources, slices that know nothing of each other (log-normal, standard deviation 1.5), nothing, and one slice alone."""
 
 REFERENCE_LEVEL = 8e-15
 """What errors are divided by where the truth is empty, m^(-2/3): the mean of the weak profile."""
@@ -409,7 +410,6 @@ def reconstruct(
     selector: HyperparameterSelector,
     *,
     seed: int = 0,
-    neighbours: int = 2,
     draws: int = POSTERIOR_DRAWS,
 ) -> Outcome:
     """Reconstruct every draw and compare it with the truth.
@@ -421,11 +421,10 @@ def reconstruct(
     precision : ndarray, (k, k)
         R of the prior.
     selector : HyperparameterSelector
-        Chooses mu.
+        Chooses mu. Where it has an attribute `neighbours`, it is given as many draws before and after each one for
+        those of neighbouring batches.
     seed : int
         Seed of the draws from the posterior.
-    neighbours : int
-        Draws before and after each one that a selector may take for neighbouring batches.
     draws : int
         Draws from each posterior.
 
@@ -434,6 +433,7 @@ def reconstruct(
     Outcome
     """
     problems = [setup.reduction.problem(one, precision, grid=setup.grid) for one in setup.data]
+    reach = int(getattr(selector, "neighbours", 0))
     found: dict[str, list[NDArray[np.float64]]] = {}
 
     def keep(**values: object) -> None:
@@ -442,17 +442,8 @@ def reconstruct(
 
     intervals = []
     for number, problem in enumerate(problems):
-        around = [
-            other
-            for n in range(number - neighbours, number + neighbours + 1)
-            if n != number and 0 <= n < len(problems)
-            for other in (problems[n],)
-        ]
-        selection = selector.select(
-            inversion.LinearProblem(
-                problem.matrix, problem.data, problem.precision, problem.n_data, problem.grid, tuple(around)
-            )
-        )
+        around = (*problems[max(0, number - reach) : number], *problems[number + 1 : number + 1 + reach])
+        selection = selector.select(replace(problem, neighbours=around))
         curve = setup.error(inversion.solve_positive(problem, 10.0**selection.log_mu_grid))
         mode = inversion.solve_positive(problem, selection.mu)
         unbounded = np.tile([0.0, np.inf], (problem.k, 1))

@@ -140,9 +140,12 @@ class Previous(_Ranged):
     """
 
     name: ClassVar[str] = "previous"
+    version: ClassVar[int] = 2
 
     criterion: Literal["gcv", "evidence", "positive_evidence", "upre"] = "gcv"
     """Criterion that is summed."""
+    neighbours: int = Field(2, ge=0, le=50)
+    """How many batches before, and how many after, take part."""
 
     def select(self, problem: LinearProblem) -> Selection:
         """Take mu of the smallest sum; the curve is the mean over the batches."""

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ...pipeline.experiment import Outcome, Setup
     from ..settings import Settings
 
-_PROFILES = ("strong", "weak", "bright-last", "empty", "single")
+_PROFILES = ("strong", "weak", "bright-last", "rough", "empty", "single")
 
 
 @click.group()
@@ -105,7 +105,7 @@ def gcv(
 
 @experiment.command()
 @click.option("--profile", "profiles", type=click.Choice(_PROFILES), multiple=True, default=_PROFILES,
-              help="True profile; may be repeated.  [default: all five]")  # fmt: skip
+              help="True profile; may be repeated.  [default: all]")  # fmt: skip
 @click.option(
     "--regulariser", "regularisers", multiple=True, help="May be repeated.  [default: all that are installed]"
 )

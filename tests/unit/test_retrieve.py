@@ -14,7 +14,7 @@ from coslidar.pipeline.geometry import Geometry, SliceGrid
 from coslidar.pipeline.parameters import InversionParameters
 from coslidar.pipeline.products import SCHEMA
 from coslidar.pipeline.response import response_matrix
-from coslidar.plugins.hyperparameter_selectors import GCV, Fixed
+from coslidar.plugins.hyperparameter_selectors import GCV, Fixed, Previous
 from coslidar.plugins.regularisers import White
 from coslidar.plugins.source_models import Gaussian
 from coslidar.plugins.turbulence_spectra import Kolmogorov
@@ -141,6 +141,31 @@ def test_subset_and_estimator_of_the_configuration(matrix: np.ndarray) -> None:
     mean = retrieve(matrix, maps.ravel(), subset="scintillation", estimator="posterior_mean").values
     np.testing.assert_array_equal(mean["cn2"], mean["cn2_posterior_mean"])
     np.testing.assert_array_equal(flux["cn2_posterior_mean"], mean["cn2_posterior_mean"])
+
+
+def test_mu_of_a_batch_and_its_neighbours(matrix: np.ndarray) -> None:
+    """A weak batch between strong ones is given the mu of most: near 1 / Cn2^2 of the strong ones."""
+    model = batch.Model(
+        geometry=GEOMETRY, grid=SliceGrid.uniform(LENGTH, 6), matrix=matrix, sampling="midpoint", regulariser=White(),
+        selector=Previous(criterion="evidence"), inversion=InversionParameters(),
+    )  # fmt: skip
+    rng = np.random.default_rng(3)
+
+    def noisy(cn2: float) -> batch.ReducedBatch:
+        maps = matrix @ np.full(6, cn2)
+        found = reduced(maps)
+        deviation = np.zeros(486)
+        deviation[GEOMETRY.independent] = np.sqrt(np.diag(found.arrays["noise_covariance"]))
+        found.arrays["maps"] = (maps + deviation * rng.standard_normal(486))[GEOMETRY.mirror].reshape(6, 9, 9)
+        return found
+
+    weak, strong = noisy(1e-15), [noisy(1e-13) for _ in range(4)]
+    broken = batch.ReducedBatch(0, 1, 0, {**weak.arrays, "maps": np.full((6, 9, 9), np.nan)})
+    alone = batch.retrieve(weak, model).values["mu"]
+    among = batch.retrieve(weak, model, [*strong, broken]).values["mu"]
+    assert np.log10(alone) == pytest.approx(30, abs=0.6)
+    assert np.log10(among) == pytest.approx(26, abs=0.6)
+    assert batch.retrieve(weak, model, [broken]).values["mu"] == alone
 
 
 def test_a_retrieval_costs_less_than_a_tenth_of_a_second(matrix: np.ndarray) -> None:
