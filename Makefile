@@ -31,10 +31,12 @@ $(VENV)/.core: $(VENV)/.python pyproject.toml constraints.txt
 	  "(PyPI or a mirror) to reach"; exit 1; }
 	@touch $@
 
-$(VENV)/.test: $(VENV)/.core
+$(VENV)/.test: $(VENV)/.core tests/example_plugin/pyproject.toml
 	@echo "installing the test tools ..."
 	@$(PIP) install -q -c constraints.txt -e ".[test,dev]" || { echo "make: the installation failed; pip needs a package" \
 	  "index (PyPI or a mirror) to reach"; exit 1; }
+	@$(PIP) install -q --no-deps -e tests/example_plugin || { echo "make: the example plugin could not be" \
+	  "installed"; exit 1; }
 	@touch $@
 
 demo: $(VENV)/.core

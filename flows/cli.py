@@ -22,7 +22,7 @@ COMMANDS = {
     "run": ("process", "Turn recordings into catalogued Cn2 profiles."),
     "report": ("results", "Draw one self-contained page of a campaign or product."),
     "catalog": ("results", "List, show, export and check products."),
-    "plugins": ("science", "List and describe installed plugins."),
+    "plugins": ("science", "List, describe and check installed plugins."),
     "response": ("science", "Compute the response matrix M of an instrument."),
     "invert": ("science", "Invert correlation data of your own with a response matrix."),
     "experiment": ("experiment", "Try priors, selectors and error bars on data whose truth is known."),

@@ -160,8 +160,8 @@ class Geometry:
         """Rows of the data vector that carry independent numbers.
 
         Auto-correlation maps satisfy C(d) = C(-d): of each such pair the entry with dy > 0, or dy = 0 and
-        dx >= 0, is kept. With two sources and the 20 subapertures of a 5 x 5 mask without corners and centre these
-        are 312 rows of 486.
+        dx >= 0, is kept. Two sources and the 20 subapertures of a 5 x 5 mask without corners and centre
+        leave 312 rows of 486. Without two sources the cross maps have none.
         """
         dx, dy = self.lags.reshape(-1, 2).T
         half = (dy > 0) | ((dy == 0) & (dx >= 0))

@@ -217,7 +217,10 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
         )
     # The root factor of the unit alone: multiplying quantities would drag fractional exponents through pint.
     ours, theirs = (float(str(registry.get_root_units(each)[0])) for each in (found, wanted))
-    return rounded(number * (ours / theirs))
+    factor = ours / theirs
+    if any(power.denominator != 1 for power in _dimensionality(wanted).values()):
+        factor = float(f"{factor:.14g}")  # 1000^(4/3) comes as 9999.999999999995
+    return rounded(number * factor)
 
 
 #: Stands for the key in a reason that is kept until the whole location of the value is known.

@@ -98,7 +98,8 @@ def _load(entry: Entry) -> type[Plugin]:
     except Exception as error:  # a third party's import may fail in any way, and must not hide the others
         raise PluginError(
             [
-                f"{entry.kind} '{entry.name}' ({entry.distribution}) failed to load: {type(error).__name__}: {error}"
+                f"{entry.kind} '{entry.name}' ({entry.distribution}) failed to load: "
+                f"{type(error).__name__}: {error}"
             ]
         ) from error
     base = KINDS[entry.kind][1]

@@ -75,6 +75,7 @@ class White(_Scaled):
     """
 
     name: ClassVar[str] = "white"
+    examples: ClassVar = ({"scale": tuple(range(1, 13))},)
 
     def precision(self, grid: SliceGrid) -> NDArray[np.float64]:
         """Identity, over the squared scale of each slice."""
@@ -119,6 +120,7 @@ class WeightedLaplacian(_Scaled):
     """
 
     name: ClassVar[str] = "weighted_laplacian"
+    examples: ClassVar = ({"reference_z": ("100 m", "2 km"), "reference_cn2": ("1e-14 m^(-2/3)", "1e-13 m^(-2/3)")},)
 
     reference_z: tuple[Length, ...] = ()
     """Distances from the pupil at which the reference is given, increasing. Empty: all slices weigh the

@@ -43,6 +43,7 @@ class Gaussian(SourceModelBase):
     """
 
     name: ClassVar[str] = "gaussian"
+    examples: ClassVar = ({"fwhm_x": "8.9 cm", "fwhm_y": "6.3 cm"},)
 
     fwhm_x: Extent = Field(ge=0)
     """Full width at half maximum along x."""
@@ -88,6 +89,7 @@ class Disc(SourceModelBase):
     """
 
     name: ClassVar[str] = "disc"
+    examples: ClassVar = ({"diameter": "8 cm"},)
 
     diameter: Extent = Field(gt=0)
     """Diameter D."""
@@ -115,6 +117,7 @@ class Rectangle(SourceModelBase):
     """
 
     name: ClassVar[str] = "rectangle"
+    examples: ClassVar = ({"width_x": "16 cm", "width_y": "12.5 cm"},)
 
     width_x: Extent = Field(gt=0)
     """Width a along x."""
@@ -142,6 +145,7 @@ class Image(SourceModelBase):
     """
 
     name: ClassVar[str] = "image"
+    examples: ClassVar = ({"pixel_size": "1 cm", "intensity": ((0, 1, 2, 0), (3, 4, 1, 1), (0, 5, 0, 0))},)
 
     pixel_size: Extent = Field(gt=0)
     """Side h of a pixel at the source."""

@@ -53,6 +53,7 @@ class VonKarman(TurbulenceSpectrumBase):
     """
 
     name: ClassVar[str] = "von_karman"
+    examples: ClassVar = ({"outer_scale": "10 m"},)
 
     outer_scale: Length = Field(gt=0)
     """Outer scale L0; kappa_0 is 2 pi / L0."""
@@ -70,6 +71,7 @@ class Tatarskii(TurbulenceSpectrumBase):
     """
 
     name: ClassVar[str] = "tatarskii"
+    examples: ClassVar = ({"inner_scale": "5 mm"}, {"inner_scale": "5 mm", "outer_scale": "0.4 m"})
 
     inner_scale: Length = Field(gt=0)
     """Inner scale l0; kappa_m is 5.92 / l0."""
@@ -92,6 +94,7 @@ class Hill(TurbulenceSpectrumBase):
     """
 
     name: ClassVar[str] = "hill"
+    examples: ClassVar = ({"inner_scale": "5 mm"}, {"inner_scale": "1 cm", "outer_scale": "2 m"})
 
     inner_scale: Length = Field(gt=0)
     """Inner scale l0; kappa_l is 3.3 / l0."""
@@ -117,6 +120,7 @@ class PowerLaw(TurbulenceSpectrumBase):
     """
 
     name: ClassVar[str] = "power_law"
+    examples: ClassVar = ({"exponent": 3.1}, {"exponent": 3.9, "reference": "1 mm"})
 
     exponent: float = Field(gt=3, lt=4)
     """Exponent a of the three-dimensional spectrum; Kolmogorov's is 11/3."""

@@ -40,6 +40,7 @@ def test_reads(written: str, unit: str, value: float) -> None:
 def test_spelling_does_not_change_the_number() -> None:
     """pint gives 3.7999999999999996e-06 for 3.8 um; a key made of that would depend on the spelling."""
     assert parse("3.8 um", "m") == parse("3.8e-6 m", "m") == parse("3800 nm", "m") == 3.8e-6
+    assert parse("1e23 km^(4/3)", "m^(4/3)") == parse("1e27 m^(4/3)", "m^(4/3)") == 1e27
 
 
 @pytest.mark.parametrize(
