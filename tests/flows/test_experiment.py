@@ -68,6 +68,18 @@ def test_chosen_rows_only() -> None:
     assert rows[1]["profiles"]["weak"]["log_mu"] == pytest.approx(27)
 
 
+def test_documented_row_is_what_comes_out() -> None:
+    """The row of the default in docs/experiment.md, for one profile: other BLAS libraries may round a choice of mu."""
+    page = (Path(__file__).parents[2] / "docs" / "experiment.md").read_text("utf-8")
+    lines = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines()]
+    head = next(line for line in lines if line[:2] == ["prior", "selector"])
+    row = next(line for line in lines if line[:2] == ["white", "gcv"])
+    documented = [float(number) for number in row[head.index("weak")].replace(";", ",").split(",")]
+    found = run("compare", "--profile", "weak", "--draws", "40", "--regulariser", "white", "--selector", "gcv")
+    cell = found.splitlines()[-1].strip("|").split("|")[2]
+    assert [float(number) for number in cell.replace(";", ",").split(",")] == pytest.approx(documented, abs=0.03)
+
+
 def test_faults_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no regulariser 'smooth'; installed"):
         run("gcv", "--regulariser", "smooth")
