@@ -89,6 +89,12 @@ class CorrelationParameters(Parameters):
     covariance: Literal["lagged", "independent"] = "lagged"
     """`lagged`: frames correlated in time, as they are; `independent`: as if no frame knew of the next
     (Sauvage et al. 2021)."""
+    vibration: Literal["absorbed", "subtracted"] = "absorbed"
+    """`absorbed`: the vibration line stays in the slope maps, for the inversion's constant to take up; `subtracted`:
+    its variance is taken off every entry of the four slope maps (Sauvage et al. 2021, section 4.2). Recorded always."""
+    flux_trend: Frequency | None = Field(default=None, gt=0)
+    """Changes of a source's light slower than this, common to all subapertures, are divided out; nothing is where it is
+    absent."""
 
 
 class ResponseParameters(Parameters):
@@ -187,7 +193,8 @@ def _name(value: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_name)]
-Text = Annotated[str, Field(max_length=MAX_TEXT)]
+#: Text of a header; its length is judged with that of all other texts, see :func:`text_faults`.
+Text = str
 Pixel = Annotated[float, Field(strict=False, allow_inf_nan=False)]
 
 
