@@ -27,15 +27,15 @@ $(VENV)/.python:
 
 $(VENV)/.core: $(VENV)/.python pyproject.toml constraints.txt
 	@echo "installing coslidar into $(VENV) (about a minute) ..."
-	@$(PIP) install -q -c constraints.txt -e . || { echo "make: the installation failed; pip needs a package index" \
+	@$(PIP) install -qq -c constraints.txt -e . || { echo "make: the installation failed; pip needs a package index" \
 	  "(PyPI or a mirror) to reach"; exit 1; }
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.core tests/example_plugin/pyproject.toml
 	@echo "installing the test tools ..."
-	@$(PIP) install -q -c constraints.txt -e ".[test,dev]" || { echo "make: the installation failed; pip needs a package" \
+	@$(PIP) install -qq -c constraints.txt -e ".[test,dev]" || { echo "make: the installation failed; pip needs a package" \
 	  "index (PyPI or a mirror) to reach"; exit 1; }
-	@$(PIP) install -q --no-deps -e tests/example_plugin || { echo "make: the example plugin could not be" \
+	@$(PIP) install -qq --no-deps -e tests/example_plugin || { echo "make: the example plugin could not be" \
 	  "installed"; exit 1; }
 	@touch $@
 

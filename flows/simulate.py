@@ -68,7 +68,8 @@ def load_scenario(scenario: str | Path) -> Scenario:
     origin = safe(str(scenario))
     path = Path(scenario)
     try:
-        if path.suffix == ".toml" or path.exists():
+        # A folder of that name is no scenario: `init demo --scenario demo` makes one.
+        if path.suffix == ".toml" or path.is_file():
             content = path.read_bytes()
         elif (name := str(scenario)) in shipped():
             content = (files("coslidar.flows.scenarios") / f"{name}.toml").read_bytes()
