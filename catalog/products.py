@@ -29,6 +29,7 @@ from ..pipeline import lineage as lineages
 from ..pipeline.parameters import Name
 from ..pipeline.products import (
     COORDINATES,
+    FIXED_COORDINATES,
     INTENSITY_KINDS,
     QUALITY_FLAGS,
     SCHEMA,
@@ -60,6 +61,9 @@ _LABELS: dict[str, tuple[str, tuple[str, ...] | None]] = {
 #: Results that hold for the wavelength of the instrument only.
 _AT_WAVELENGTH = (
     "r0_profile",
+    "r0_direct",
+    "zernike_variance",
+    "zernike_variance_kolmogorov",
     "scintillation_index_direct",
     "scintillation_index_profile",
     "scintillation_index_point",
@@ -178,7 +182,7 @@ def assemble(
     document = dict(lineages.document(lineage) if isinstance(lineage, lineages.Key) else lineage)
     identity = check_digest(archive_identity, "archive_identity")
 
-    fixed = {name: np.asarray(value) for name, value in static.items()}
+    fixed = {**FIXED_COORDINATES, **{name: np.asarray(value) for name, value in static.items()}}
     grids = [fixed["log_mu_grid"]] if "log_mu_grid" in fixed else []
     grids += [np.asarray(r.values["log_mu_grid"]).reshape(-1) for r in ordered if "log_mu_grid" in r.values]
     if grids:

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import convergence, correlation, extraction, inversion, noise, posterior, turbulence
+from . import checks, convergence, correlation, extraction, inversion, noise, posterior, timing, turbulence, vibration
 from .geometry import MAP_KINDS
-from .products import INTENSITY_KINDS, QUALITY_FLAGS, SLOPE_KINDS, BatchResult, Measurements
+from .products import INTENSITY_KINDS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -33,14 +33,12 @@ if TYPE_CHECKING:
 
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
-REDUCE_VERSION = 1
+REDUCE_VERSION = 2
 RESPONSE_VERSION = 1
 RETRIEVE_VERSION = 2
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
-#: A step of the time stamps longer than this many frame periods is a gap.
-GAP = 1.5
 
 
 class BatchError(ValueError):
@@ -59,7 +57,8 @@ class ReducedBatch:
         Bits of :data:`coslidar.pipeline.products.QUALITY_FLAGS` known so far.
     arrays : dict of str to ndarray
         `maps` (6, 2p - 1, 2q - 1), `noise_covariance` (m, m), `n_effective` (3,), `mean_flux` (S,),
-        `scintillation_index` (S,), `valid_fraction` (S,), `n_frames`.
+        `scintillation_index` (S,), `valid_fraction` (S,), `n_frames`, and checks under their names in
+        :data:`coslidar.pipeline.products.SCHEMA`.
     """
 
     start: int
@@ -163,8 +162,18 @@ def measure(
         warnings.simplefilter("ignore", RuntimeWarning)  # a spot that is never measured has no mean
         mean = np.nanmean(flux, axis=0)
     height, width = layout.window
-    detection = noise.flux_noise_variance(mean, pixel_noise[0], height * width, header.instrument.gain)
-    return Measurements(time, slopes, flux, flag, detection)
+    gain = header.instrument.gain
+    return Measurements(
+        time,
+        slopes,
+        flux,
+        flag,
+        flux_noise=noise.flux_noise_variance(mean, pixel_noise[0], height * width, gain),
+        slope_noise=noise.slope_noise_variance(
+            layout, flux[:: noise.EVERY], pixel_noise[0], gain, recentred=parameters.method != "moving_maximum"
+        ),
+        centroid_gain=extraction.response_to_tilt(layout, parameters),
+    )
 
 
 def reduce(
@@ -202,15 +211,27 @@ def reduce(
     if frames < MIN_FRAMES:
         raise BatchError(f"{frames} frames are too few for correlations; at least {MIN_FRAMES} are needed")
     slopes, flux, flag = measurements.slopes, measurements.flux, measurements.flag
+    repeated = timing.repeated(slopes, flux)
+    if repeated.sum() > 0.5 * frames:
+        raise BatchError(f"{repeated.sum()} of {frames} frames repeat the one before: the camera was frozen")
+    light, out = _light(flux)
+    if repeated.any() or out.any():
+        slopes, flux = slopes.copy(), flux.copy()
+        lost = out | repeated[:, None]
+        slopes[np.broadcast_to(lost[:, None], slopes.shape[:3])] = np.nan
+        flux[lost] = np.nan
+        light[lost] = np.nan
     seen = np.isfinite(flux)
     valid = seen.mean(axis=(0, 2))
     for number, fraction in enumerate(valid):
         if not seen[:, number].any(axis=0).all() or fraction < 0.5:
-            lost = int((~seen[:, number].any(axis=0)).sum())
+            never = int((~seen[:, number].any(axis=0)).sum())
             raise BatchError(
                 f"source {number + 1} could be measured in {fraction:.1%} of its spots "
-                f"({lost} of {flux.shape[2]} subapertures never); at least half of each is needed"
+                f"({never} of {flux.shape[2]} subapertures never); at least half of each is needed"
             )
+    if parameters.flux_trend is not None:
+        flux = flux / timing.slow_part(light, frame_rate, parameters.flux_trend)[:, :, None]
     found = correlation.finalise(correlation.accumulate(slopes, flux), geometry)
     if parameters.covariance == "lagged":
         lagged = convergence.lagged(slopes, flux, geometry)
@@ -220,16 +241,45 @@ def reduce(
         n_effective = np.full(3, float(frames))
     detection = (measurements.flux_noise / found.mean_flux**2).mean(axis=1)
 
+    tilt = timing.pupil_mean(slopes)
+    line = vibration.find_line(timing.regular(tilt.mean(axis=2), measurements.time, frame_rate), frame_rate)
+    maps = found.maps
+    if parameters.vibration == "subtracted":
+        maps = maps.copy()
+        for number, kind in enumerate(MAP_KINDS):
+            if kind in SLOPE_KINDS:
+                maps[number] -= line.variance["xy".index(kind[0])]
+
+    stamps = timing.stamps(measurements.time, frame_rate)
+    index = found.scintillation_index - detection
+    modes = checks.zernike_check(found, measurements.slope_noise, geometry)
+    logarithm = checks.log_amplitude(flux, found.mean_flux)
+    steady = checks.stationarity(slopes, flux, found, covariance, geometry)
+    spot_drift, flux_drift = timing.trend(tilt).T, timing.trend(light)
+    slope_variance = _mean(np.diagonal(found.covariance).reshape(3, *flux.shape[1:])[:2]).T
     period = round(1e9 / frame_rate)
-    steps = np.diff(measurements.time)
-    missing = int(np.round(steps[steps > GAP * period] / period - 1).sum())
     quality = 0
     span = (int(measurements.time[-1]) - int(measurements.time[0]) + period) / 1e9
     for name, applies in (
         ("short", span < 0.5 * duration),
-        ("gaps", missing > 0.01 * frames),
+        ("gaps", stamps.missing > 0.01 * frames),
         ("lost_spots", float(seen.mean()) < 0.99),
         ("saturated", float(((flag & extraction.FLAGS["saturated"]) > 0).mean()) > 0.01),
+        (
+            "irregular_time",
+            stamps.backward > 0 or abs(stamps.rate / frame_rate - 1) > 0.01 or stamps.jitter * frame_rate > 0.1,
+        ),
+        ("repeated_frames", repeated.sum() > 0.01 * frames),
+        ("source_out", (out.mean(axis=0) > 0.01).any()),
+        # A line from -a/2 to a/2 has the variance a^2 / 12.
+        ("drifting_spots", (spot_drift**2 / 12 > 0.25 * slope_variance).any()),
+        ("drifting_flux", (flux_drift**2 / 12 > 0.1 * index).any()),
+        ("vibration", np.isfinite(line.frequency)),
+        ("tilt_response", (np.abs(measurements.centroid_gain - 1) > 0.05).any()),
+        ("not_kolmogorov", (modes.misfit > checks.MISFIT).any()),
+        ("not_lognormal", (logarithm.distance > checks.DISTANCE).any()),
+        ("rytov_limit", (index > checks.RYTOV).any()),
+        ("not_stationary", (steady.deviation > np.maximum(checks.UNSTEADY, 4 * steady.error)).any()),
     ):
         quality |= QUALITY_FLAGS[name][0] * bool(applies)
     return ReducedBatch(
@@ -237,32 +287,54 @@ def reduce(
         stop=int(measurements.time[-1]) + period,
         quality_flag=quality,
         arrays={
-            "maps": found.maps,
+            "maps": maps,
             "noise_covariance": covariance,
             "n_effective": n_effective,
             "mean_flux": found.mean_flux.mean(axis=1),
-            "scintillation_index": found.scintillation_index - detection,
+            "scintillation_index": index,
             "valid_fraction": valid,
             "n_frames": np.asarray(frames),
+            "noise_variance_slope_detector": _mean(measurements.slope_noise).T,
+            "noise_variance_intensity_detector": detection,
+            "centroid_gain": measurements.centroid_gain.T,
+            "vibration_frequency": np.asarray(line.frequency),
+            "vibration_variance": line.variance,
+            "vibration_significance": np.asarray(line.significance),
+            "zernike_variance": modes.variance,
+            "zernike_variance_kolmogorov": modes.kolmogorov,
+            "zernike_misfit": modes.misfit,
+            "r0_direct": modes.r0,
+            "log_amplitude_count": logarithm.histogram,
+            "log_amplitude_mean": logarithm.mean,
+            "log_amplitude_deviation": logarithm.deviation,
+            "log_amplitude_distance": logarithm.distance,
+            "stationarity_deviation": steady.deviation,
+            "stationarity_error": steady.error,
+            "spot_drift": spot_drift,
+            "flux_drift": flux_drift,
+            "frame_rate_measured": np.asarray(stamps.rate),
+            "time_jitter": np.asarray(stamps.jitter),
+            "n_missing": np.asarray(stamps.missing),
+            "n_repeated": np.asarray(int(repeated.sum())),
+            "out_fraction": out.mean(axis=0),
         },
     )
 
 
-def _known(reduced: ReducedBatch, model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Data vector and precision of the prior."""
-    return correlation.data_vector(reduced.arrays["maps"]), model.regulariser.precision(model.grid)
+def _light(flux: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Relative light of each source over the pupil, (T, S), and the frames in which it is out."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a spot that is never measured has no mean
+        usual = np.nanmean(flux[:: checks.EVERY], axis=0)
+    light = timing.pupil_mean(flux / np.where(usual > 0, usual, np.nan))
+    return light, timing.outages(light)
 
 
-def _whitened(reduced: ReducedBatch, model: Model) -> inversion.Reduction:
-    return inversion.prepare(
-        correlation.data_vector(reduced.arrays["maps"]),
-        reduced.arrays["noise_covariance"],
-        model.matrix,
-        rows=model.geometry.independent,
-        subset=model.inversion.subset,
-        noise_bias=model.inversion.noise_bias == "joint",
-        slope_offset=model.inversion.slope_offset == "joint",
-    )
+def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Mean over the subapertures that have a value."""
+    seen = np.isfinite(values)
+    total = np.where(seen, values, 0.0).sum(axis=-1)
+    return np.where(seen.any(axis=-1), total / np.maximum(seen.sum(axis=-1), 1), np.nan)
 
 
 def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBatch] = ()) -> BatchResult:
@@ -378,6 +450,8 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "valid_fraction": arrays["valid_fraction"],
         "chi2_reduced": profile.chi2_reduced,
     }
+    # Checks that were made with the correlations.
+    values |= {name: value for name, value in arrays.items() if name in SCHEMA and name not in values}
     negative = any(
         value < -3 * error for name, (value, error) in unknown.items() if name.startswith("noise") and error > 0
     )
@@ -394,6 +468,24 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         stop=reduced.stop,
         values={name: np.asarray(value) for name, value in values.items()},
         quality_flag=quality,
+    )
+
+
+def _known(reduced: ReducedBatch, model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Data vector and precision of the prior."""
+    return correlation.data_vector(reduced.arrays["maps"]), model.regulariser.precision(model.grid)
+
+
+def _whitened(reduced: ReducedBatch, model: Model) -> inversion.Reduction:
+    """Whitening for the noise of a batch."""
+    return inversion.prepare(
+        correlation.data_vector(reduced.arrays["maps"]),
+        reduced.arrays["noise_covariance"],
+        model.matrix,
+        rows=model.geometry.independent,
+        subset=model.inversion.subset,
+        noise_bias=model.inversion.noise_bias == "joint",
+        slope_offset=model.inversion.slope_offset == "joint",
     )
 
 

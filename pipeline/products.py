@@ -24,6 +24,10 @@ class Measurements:
         Bits of :data:`coslidar.pipeline.extraction.FLAGS`.
     flux_noise : ndarray of float64, (S, A)
         Variance of a flux by detection noise, counts^2.
+    slope_noise : ndarray of float64, (2, S, A)
+        Variance of the slopes by detection noise, rad^2.
+    centroid_gain : ndarray of float64, (2, S)
+        Response of the slopes along x and y to a known tilt of the mean spot.
     """
 
     time: NDArray[np.int64]
@@ -31,6 +35,8 @@ class Measurements:
     flux: NDArray[np.float64]
     flag: NDArray[np.uint8]
     flux_noise: NDArray[np.float64]
+    slope_noise: NDArray[np.float64]
+    centroid_gain: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -68,6 +74,12 @@ def _schema(*rows: tuple[str, str, str, str, str]) -> dict[str, Variable]:
 SLOPE_KINDS = ("xx_auto", "yy_auto", "xx_cross", "yy_cross")
 INTENSITY_KINDS = ("ii_auto", "ii_cross")
 
+#: Radial orders of the Zernike modes that are fitted to the slopes.
+RADIAL_ORDERS = (1, 2, 3, 4, 5)
+#: Width and centres of the bins of the log-amplitude histogram.
+LOG_AMPLITUDE_STEP = 0.01
+LOG_AMPLITUDES: NDArray[np.float64] = (np.arange(200) - 99.5) / 100
+
 #: Coordinates of a product.
 COORDINATES = _schema(
     ("time", "time", "ns", "int64", "start of the batch, UTC, nanoseconds since 1970-01-01T00:00:00"),
@@ -76,7 +88,15 @@ COORDINATES = _schema(
     ("dy", "dy", "m", "float64", "separation of the subapertures along y, first minus second"),
     ("dx", "dx", "m", "float64", "separation of the subapertures along x, first minus second"),
     ("log_mu_grid", "log_mu_grid", "1", "float64", "log10 of the hyperparameter mu in m^(4/3)"),
+    ("radial_order", "radial_order", "1", "int64", "radial order of Zernike modes"),
+    ("log_amplitude", "log_amplitude", "1", "float64", "log-amplitude chi = ln(i / mean i) / 2, middle of a bin"),
 )
+
+#: Coordinates that are the same in every product.
+FIXED_COORDINATES: dict[str, NDArray[np.generic]] = {
+    "radial_order": np.array(RADIAL_ORDERS, dtype=np.int64),
+    "log_amplitude": LOG_AMPLITUDES,
+}
 
 #: Every other variable of a product, schema version 1.
 SCHEMA = _schema(
@@ -116,6 +136,41 @@ SCHEMA = _schema(
     ("noise_variance_intensity_error", "time", "1", "float64", "standard error of noise_variance_intensity"),
     ("slope_offset", "time axis", "rad^2", "float64", "constant of the slope maps, joint estimate"),
     ("slope_offset_error", "time axis", "rad^2", "float64", "standard error of slope_offset"),
+    (
+        "noise_variance_slope_detector",
+        "time source axis",
+        "rad^2",
+        "float64",
+        "detection noise of the slopes, predicted",
+    ),
+    ("noise_variance_intensity_detector", "time source", "1", "float64", "detection noise of relative flux, predicted"),
+    ("centroid_gain", "time source axis", "1", "float64", "response of the slopes to a known tilt of the mean spot"),
+    ("vibration_frequency", "time", "Hz", "float64", "vibration line, at its alias if above half the frame rate"),
+    ("vibration_variance", "time axis", "rad^2", "float64", "variance of the slopes by the vibration line"),
+    ("vibration_significance", "time", "1", "float64", "strongest line over the continuum, in its deviations"),
+    ("zernike_variance", "time source radial_order", "rad^2", "float64", "variance per mode of phase, noise removed"),
+    (
+        "zernike_variance_kolmogorov",
+        "time source radial_order",
+        "rad^2",
+        "float64",
+        "the same of turbulence with r0_direct",
+    ),
+    ("zernike_misfit", "time source", "1", "float64", "rms of ln(variance / Kolmogorov) over radial orders 2 to 5"),
+    ("r0_direct", "time source", "m", "float64", "Fried parameter from Zernike variances of the extended source"),
+    ("log_amplitude_count", "time source log_amplitude", "1", "int64", "histogram of the log-amplitude"),
+    ("log_amplitude_mean", "time source", "1", "float64", "mean of the Gaussian fitted to the log-amplitude"),
+    ("log_amplitude_deviation", "time source", "1", "float64", "standard deviation of that Gaussian"),
+    ("log_amplitude_distance", "time source", "1", "float64", "largest difference of its cumulative distribution"),
+    ("stationarity_deviation", "time axis_kind", "1", "float64", "largest deviation of a third's variance, relative"),
+    ("stationarity_error", "time axis_kind", "1", "float64", "the same by chance for one third, 1 sigma"),
+    ("spot_drift", "time source axis", "rad", "float64", "linear drift of the spots over the batch"),
+    ("flux_drift", "time source", "1", "float64", "linear drift of the light over the batch, relative"),
+    ("frame_rate_measured", "time", "Hz", "float64", "frame rate from the time stamps, without gaps"),
+    ("time_jitter", "time", "s", "float64", "scatter of the steps of the time stamps, without gaps"),
+    ("n_missing", "time", "1", "int64", "frames missing in gaps of the time stamps"),
+    ("n_repeated", "time", "1", "int64", "frames that repeat the one before, left out"),
+    ("out_fraction", "time source", "1", "float64", "part of the frames in which the source is out, left out"),
     ("n_frames", "time", "1", "int64", "frames in the batch"),
     ("n_effective", "time axis_kind", "1", "float64", "effectively independent frames for x, y slopes and flux"),
     ("valid_fraction", "time source", "1", "float64", "fraction of slopes and fluxes that could be measured"),
@@ -135,6 +190,21 @@ QUALITY_FLAGS: dict[str, tuple[int, int, str]] = {
     "negative_noise": (64, 1, "a joint noise variance is negative by more than three of its errors"),
     "poor_fit": (128, 1, "chi2 per datum above 3"),
     "strong_scintillation": (256, 1, "index of one point of the source above 0.3: first-order theory fails"),
+    "irregular_time": (
+        512,
+        1,
+        "time stamps run backward, scatter by a tenth of a frame, or are 1 % off the frame rate",
+    ),
+    "repeated_frames": (1024, 1, "more than 1 % of the frames repeat the one before; they are left out"),
+    "source_out": (2048, 1, "a source is out in more than 1 % of the frames, which are left out"),
+    "drifting_spots": (4096, 1, "a drift of the spots holds more than a quarter of the slope variance of a source"),
+    "drifting_flux": (8192, 1, "a drift of the light holds more than a tenth of the scintillation of a source"),
+    "vibration": (16384, 0, "a vibration line is found in the slopes"),
+    "tilt_response": (32768, 1, "slopes answer to a known tilt with a gain that is 5 % or more off 1"),
+    "not_kolmogorov": (65536, 1, "Zernike variances of radial orders 2 to 5 are not in Kolmogorov's ratio"),
+    "not_lognormal": (131072, 1, "the log-amplitude is not Gaussian"),
+    "rytov_limit": (262144, 2, "a measured scintillation index is above 1.2, the limit of weak perturbations"),
+    "not_stationary": (524288, 1, "a variance differs between the thirds of the batch by more than 30 % and chance"),
 }
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from coslidar.catalog.products import assemble
 from coslidar.pipeline.lineage import make_key
-from coslidar.pipeline.products import SCHEMA, BatchResult
+from coslidar.pipeline.products import FIXED_COORDINATES, SCHEMA, BatchResult
 
 #: 2012-09-14T12:15:00 UTC, in ns; not a whole microsecond, so that rounding would show.
 START = 1347624900000000123
@@ -19,6 +19,7 @@ def batch(number=0, seed=0, *, slices=4, grid=5, flag=0):
     """A batch in which every variable of the schema has drawn values."""
     random = np.random.default_rng([seed, number])
     sizes = {"z": slices, "z_true": slices, "log_mu_grid": grid, "slope_kind": 4, "intensity_kind": 2}
+    sizes |= {name: len(value) for name, value in FIXED_COORDINATES.items()}
     sizes |= {"dy": 5, "dx": 3, "source": 2, "axis": 2, "axis_kind": 3, "bound": 2}
     values = {
         name: (10 * random.random([sizes[dim] for dim in variable.dims[1:]])).astype(variable.dtype)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from coslidar.pipeline.products import COORDINATES, INTENSITY_KINDS, SCHEMA, SLOPE_KINDS
+from coslidar.pipeline.products import COORDINATES, FIXED_COORDINATES, INTENSITY_KINDS, SCHEMA, SLOPE_KINDS
 
 START = 1_347_624_900_000_000_000  # 2012-09-14T12:15:00Z
 MASK = np.array([[0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [1, 1, 0, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0]])
@@ -136,6 +136,12 @@ def product(
         "quality_flag": np.where(index * 4 > 0.3, 256, 0).astype("i4"),
         "quality_level": np.where(index * 4 > 0.3, 1, 0).astype("i1"),
     }  # fmt: skip
+    # Checks that no figure shows yet.
+    sizes = {"time": batches, "source": sources, "axis": 2, "axis_kind": 3}
+    sizes |= {name: len(value) for name, value in FIXED_COORDINATES.items()}
+    for name in sorted(set(SCHEMA) - set(values) - {"r0_direct"}):
+        values[name] = np.full([sizes[dim] for dim in SCHEMA[name].dims], 0.01).astype(SCHEMA[name].dtype)
+    values["r0_direct"] = (0.13 * trend**-0.6)[:, None] * np.array([1.02, 0.98])[:sources]
     for batch in failed:
         for name, variable in SCHEMA.items():
             if variable.dims[0] == "time" and variable.dtype == "float64":
@@ -147,6 +153,7 @@ def product(
     if decoded:
         values["time_bounds"] = values["time_bounds"].astype("datetime64[ns]")
     coordinates = {"time": times, "z": centre, "z_true": centre, "dy": lag, "dx": lag, "log_mu_grid": grid}
+    coordinates |= FIXED_COORDINATES
     assert set(values) == set(SCHEMA)
     assert set(coordinates) == set(COORDINATES)
     return xr.Dataset(

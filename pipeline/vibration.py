@@ -1,0 +1,122 @@
+"""The vibration line: the strongest narrow line in the temporal spectrum of the slopes that all spots share.
+
+A shaking instrument moves every spot by the same amount, so the line stands out in the mean slope over subapertures
+and sources, in which turbulence and detection noise are small at high frequencies. Its variance is the power above the
+continuum to either side. Sauvage et al. 2021 (arXiv:2111.08003), Sec. 4.2, subtract it from every entry of the four
+slope maps (50 Hz, the cryocooler of the camera); here the inversion's constant of the slope maps takes it up by
+default.
+
+A line above half the frame rate appears at its alias; its variance is the same. The spectrum's floor is no measure of
+noise: winds of a few m/s move the scintillation pattern by more than its size from frame to frame.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from scipy import fft, ndimage
+from scipy.special import gammaincc
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+#: Width of the cells of the spectrum among which a peak is looked for, Hz.
+CELL = 0.5
+#: To either side of a cell, width of the spectrum that its continuum is taken from, Hz.
+SURROUNDINGS = 3.0
+#: Half the width of the band that a line is summed over, Hz, and at most that part of its frequency. A machine whose
+#: phase wanders has wide wings: of the sample recording's line 91 % lies within 0.5 Hz, 95 % within 2 Hz.
+HALF_WIDTH, RELATIVE = 2.0, 0.05
+#: Lines are looked for from here on, Hz: below, the turbulent tilt has a slope that looks like one.
+LOWEST = 5.0
+#: Chance that a spectrum without a line passes as one with.
+FALSE_ALARM = 1e-6
+
+
+class Vibration(NamedTuple):
+    """The strongest line.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz, as the frame rate shows it; NaN where there is no line.
+    variance : ndarray, (2,)
+        Of the x and y slopes by vibration, rad^2; 0 where there is no line.
+    significance : float
+        Power of the strongest peak over the continuum, in standard deviations of the continuum.
+    """
+
+    frequency: float
+    variance: Floats
+    significance: float
+
+
+def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
+    """Look for a vibration line.
+
+    Parameters
+    ----------
+    tilt : ndarray, (T, 2)
+        Mean slopes along x and y, rad, equally spaced in time; NaN where a frame is missing.
+    frame_rate : float
+        Hz.
+
+    Returns
+    -------
+    Vibration
+        Without a line also where the record is shorter than two seconds or has too low a rate.
+
+    Notes
+    -----
+    Steps from frame to frame are analysed, not the slopes themselves: the ends of a record do not meet, and the jump
+    between them, mostly slow tilt, would hide weak lines; divided by the spectrum of a step the result is that of the
+    slopes, with every frame of the same weight. The periodograms of both axes are averaged in cells of `CELL`, relative
+    to the running median of their surroundings. In a smooth spectrum such an average follows a gamma distribution; the
+    largest of all cells must exceed what it reaches with a chance of `FALSE_ALARM`. The variance is the sum over the
+    band of the line, less the mean level of as much spectrum on either side.
+    """
+    nothing = Vibration(np.nan, np.zeros(2), np.nan)
+    missing = ~np.isfinite(tilt).all(axis=1)
+    length = int(fft.prev_fast_len(len(tilt) - 1)) if len(tilt) > 4096 else len(tilt) - 1
+    per_cell = int(CELL * length / frame_rate)
+    if per_cell < 1 or frame_rate / 2 < LOWEST + SURROUNDINGS or missing.mean() > 0.5:
+        return nothing
+    values = np.asarray(tilt, dtype=np.float64)
+    if missing.any():
+        frames, seen = np.arange(len(values)), np.flatnonzero(~missing)
+        values = np.stack([np.interp(frames, seen, column[seen]) for column in values.T], axis=1)
+    present = 1.0 - float(missing[: length + 1].mean())
+    frequency = np.arange(length // 2 + 1) * frame_rate / length
+    power = np.abs(fft.rfft(np.diff(values, axis=0)[:length], axis=0)) ** 2 * (2 / (length**2 * present))
+    power[1:] /= 4 * np.sin(np.pi * frequency[1:, None] / frame_rate) ** 2
+
+    cells = len(power) // per_cell
+    cell = power[: cells * per_cell].reshape(cells, per_cell, 2).mean(axis=1)
+    around = 2 * round(SURROUNDINGS / CELL) + 1
+    continuum = np.stack([ndimage.median_filter(column, around, mode="nearest") for column in cell.T], axis=1)
+    # The median of a gamma distribution lies below its mean (Wilson and Hilferty).
+    continuum /= (1 - 1 / (9 * per_cell)) ** 3
+    if not (continuum > 0).all():
+        return nothing
+    searched = (np.arange(cells) + 0.5) * per_cell * frame_rate / length >= LOWEST
+    excess = np.where(searched, (cell / continuum).mean(axis=1), 0.0)
+    peak = int(np.argmax(excess))
+    # A median of n numbers scatters as the mean of n / 1.57 of them; its error adds to that of the cell.
+    degrees = 2 * per_cell / (1 + 1.57 / around)
+    significance = float((excess[peak] - 1) * np.sqrt(degrees))
+    if float(gammaincc(degrees, degrees * excess[peak])) * int(searched.sum()) > FALSE_ALARM:
+        return Vibration(np.nan, np.zeros(2), significance)
+
+    # The line may lie on the border of two cells.
+    near = np.arange(max((peak - 1) * per_cell, 1), min((peak + 2) * per_cell, len(power)))
+    above = (power[near] / continuum[peak]).sum(axis=1)
+    reach = np.abs(near - near[np.argmax(above)]) <= per_cell // 2
+    centre = float((frequency[near] * above)[reach].sum() / above[reach].sum())
+    half = min(HALF_WIDTH, RELATIVE * centre)
+    band = np.abs(frequency - centre) <= half
+    beside = ~band & (np.abs(frequency - centre) <= 2 * half)
+    level = power[beside].mean(axis=0)
+    return Vibration(centre, np.maximum(power[band].sum(axis=0) - band.sum() * level, 0.0), significance)
