@@ -297,9 +297,9 @@ def draw(
 ) -> Setup:
     """Data of a known profile with drawn convergence noise.
 
-    As in the paper, the covariance is diagonalised and white noise drawn in its eigenvectors, here those of the
-    correlation matrix: slopes are 1e-8 of fluxes in their units and would be lost. Draw i of a seed is the same however
-    many are drawn.
+    As in the paper the covariance is diagonalised, here as a correlation matrix: slopes are 1e-8 of fluxes in their
+    units and would be lost. White noise is multiplied with the symmetric square root. Draw i of a seed is the same
+    however many are drawn, and on every machine but for rounding.
 
     Parameters
     ----------
@@ -331,14 +331,15 @@ def draw(
     rows = geometry.independent
     deviation = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / deviation / deviation[:, None])
-    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    # The symmetric root is unique: eigenvectors alone change sign, or turn among equals, with the BLAS and its threads.
+    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     white = np.random.default_rng(seed).standard_normal((draws, len(rows)))
     clean = matrix @ truth
     for kind, variance in enumerate(detection_noise):
         size = geometry.map_shape[0] * geometry.map_shape[1]
         clean[AUTO_MAP[kind] * size + size // 2] += variance
     data = np.tile(clean, (draws, 1))
-    data[:, rows] += (white @ root.T) * deviation
+    data[:, rows] += (white @ root) * deviation
     reduction = inversion.prepare(data, covariance, matrix, rows=rows, noise_bias=noise_bias, slope_offset=slope_offset)
     return Setup(name, np.asarray(truth, dtype=float), grid, data, reduction)
 

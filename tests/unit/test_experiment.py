@@ -177,6 +177,24 @@ def test_more_draws_begin_with_the_same(matrix: np.ndarray, signals: np.ndarray)
     np.testing.assert_allclose(few.data / scale, many.data[:3] / scale, atol=1e-9)
 
 
+def test_draws_do_not_depend_on_the_choice_of_eigenvectors(
+    matrix: np.ndarray, signals: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other libraries return eigenvectors of other signs; a seed must give the same data."""
+    before = drawn(matrix, signals, 3)
+    whole = np.linalg.eigh
+
+    def turned(a: np.ndarray) -> Any:
+        values, vectors = whole(a)
+        return values, vectors * np.where(np.arange(len(values)) % 2, 1.0, -1.0)
+
+    covariance = experiment.convergence_covariance(GEOMETRY, signals)
+    monkeypatch.setattr(experiment.np.linalg, "eigh", turned)
+    after = experiment.draw("x", CN2, GEOMETRY, GRID, matrix, covariance, draws=3, seed=3)
+    scale = np.abs(before.data).max(axis=0)
+    np.testing.assert_allclose(after.data / scale, before.data / scale, atol=1e-9)
+
+
 def test_numbers_of_an_outcome(matrix: np.ndarray, signals: np.ndarray) -> None:
     """Errors, gaps and bars against plain formulas on what the outcome holds."""
     setup = drawn(matrix, signals, 8)
