@@ -91,6 +91,8 @@ def time_axis(ax: Axes, datasets: Sequence[Dataset]) -> Axes:
     return ax
 
 
+#: Columns of the time-distance map that would fill its width, if they were as narrow as one may get.
+NARROWEST = 40
 #: Inches kept free at the left, at the right, and around the time axes.
 _LEFT, _RIGHT, _LINE = 1.0, 0.45, 0.2
 
@@ -154,8 +156,9 @@ def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     products = listed(datasets)
     scale = cn2_scale(products)
     image, corners = None, []
-    for dataset in products:
-        cn2, limit, border = values(dataset, "cn2"), bounds(dataset) / DAY, edges(dataset)
+    columns = _visible([bounds(dataset) / DAY for dataset in products])
+    for dataset, limit in zip(products, columns, strict=True):
+        cn2, border = values(dataset, "cn2"), edges(dataset)
         if cn2 is None:
             continue
         active = _active(dataset, cn2)
@@ -178,11 +181,29 @@ def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     ax.set_ylim(min(edges(d)[0] for d in products), max(edges(d)[-1] for d in products))
     ax.set_ylabel("distance from the pupil z (m)")
     time_axis(ax, products)
+    # The last column may have been widened beyond the last batch.
+    low, high = ax.get_xlim()
+    ax.set_xlim(low, max(high, max(limit[-1, 1] for limit in columns) + 0.005 * (high - low)))
     if image is not None:
         bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
         bar.set_label(r"$C_n^2$ (m$^{-2/3}$)")
         bar.outline.set_linewidth(0.6)
     return ax
+
+
+def _visible(limits: Sequence[Floats]) -> list[Floats]:
+    """Bounds of the columns: those of the batches, widened to the right where a column would be too narrow to see.
+
+    A minute every quarter of an hour would be slivers; no column reaches into the next one.
+    """
+    starts = np.sort(np.concatenate([limit[:, 0] for limit in limits]))
+    wanted = (max(limit[:, 1].max() for limit in limits) - starts[0]) / NARROWEST
+    widened = []
+    for limit in limits:
+        following = np.append(starts, np.inf)[np.searchsorted(starts, limit[:, 0], side="right")]
+        room = limit[:, 0] + np.minimum(wanted, 0.9 * (following - limit[:, 0]))
+        widened.append(np.stack([limit[:, 0], np.maximum(limit[:, 1], room)], axis=1))
+    return widened
 
 
 def _active(dataset: Dataset, cn2: Floats) -> NDArray[np.bool_]:
