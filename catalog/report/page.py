@@ -151,8 +151,9 @@ TIME_PANELS = (
     TimePanel(
         "map",
         "When and where is the turbulence strong?",
-        "One column per batch (widened to the right where it would be too narrow to see), one row per slice; brighter is stronger, on a logarithmic scale taken from the "
-        "data. Blank: nothing was measured. Hatched: the positivity constraint holds the slice at zero.",
+        "One column per batch (widened to the right where it would be too narrow to see), one row per slice; "
+        "brighter is stronger, on a logarithmic scale taken from the data. Blank: "
+        "nothing was measured. Hatched: the positivity constraint holds the slice at zero.",
         (10.0, 4.9),
         over.compose_time_distance,
         over.describe_time_distance,
