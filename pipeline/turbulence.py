@@ -27,9 +27,10 @@ if TYPE_CHECKING:
 
 Sampling = Literal["mean", "midpoint"]
 
-#: Index of one point of the source above which first-order theory is off by more than about 6 %: wave optics gives
-#: 0.99, 0.95 and 0.88 of the first-order scintillation where that index is near 0.07, 0.25 and 0.6.
-WEAK_INDEX = 0.3
+#: First-order index of one point of the source above which first-order theory is off by more than about 5 %: wave
+#: optics gives 0.99, 0.95 and 0.88 of the first-order scintillation where that index is near 0.1, 0.4 and 0.9 (profiles
+#: of one shape whose index averaged over the source is 0.014, 0.05 and 0.12).
+WEAK_INDEX = 0.4
 
 
 def z_max(geometry: Geometry) -> float:
@@ -303,7 +304,7 @@ def scintillometer_weights(
         Weights, normalised to a sum of 1.
     """
     k = 2 * np.pi / wavelength
-    # kappa = u^3 takes the singularity out; beyond 60 radii of the larger blur nothing is left.
+    # kappa = u^3 takes the singularity out; beyond 300 radii of the larger blur nothing is left.
     nodes, rule = np.polynomial.legendre.leggauss(32)
 
     def average(x: Array) -> Array:
@@ -312,7 +313,7 @@ def scintillometer_weights(
 
     def weight(z: float) -> float:
         near, far = near_diameter * (1 - z / path_length) / 2, far_diameter * z / path_length / 2
-        edges = np.linspace(0, (60 / max(near, far)) ** (1 / 3), 41)
+        edges = np.linspace(0, (300 / max(near, far)) ** (1 / 3), 121)
         half = np.diff(edges)[:, None] / 2
         u = (edges[:-1, None] + half) + half * nodes
         kappa = u**3
