@@ -126,7 +126,8 @@ def compare(
     """Compare every prior with every selector on the same draws, as a Markdown table.
 
     Each cell: error of the MAP profile and of the posterior mean at the chosen mu, over the mean of the truth, and the
-    shares of slices and draws that the 68 and 95 % intervals hold.
+    shares of slices and draws that the 68 and 95 % intervals hold. JSON also has the errors of each draw, for paired
+    comparisons: draws of one seed are the same in every row.
     """
     from ...pipeline.experiment import reconstruct
     from ...plugins.registry import available
@@ -146,12 +147,11 @@ def compare(
         click.echo("| prior | selector | " + " | ".join(profiles) + " |")
         click.echo("|---|---|" + "---|" * len(profiles))
     for prior, criterion, settings in chosen:
-        found = {
-            setup.name: _numbers(
-                reconstruct(setup, settings.regulariser().precision(setup.grid), settings.selector(), seed=seed)
-            )
-            for setup in setups
-        }
+        found = {}
+        for setup in setups:
+            outcome = reconstruct(setup, settings.regulariser().precision(setup.grid), settings.selector(), seed=seed)
+            each = {"errors_map": outcome.error_map.tolist(), "errors_mean": outcome.error_mean.tolist()}
+            found[setup.name] = {**_numbers(outcome), **each}
         rows.append({"regulariser": prior, "selector": criterion, "profiles": found})
         if not as_json:
             cells = (

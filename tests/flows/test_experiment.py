@@ -65,7 +65,10 @@ def test_chosen_rows_only() -> None:
     )  # fmt: skip
     assert [row["selector"] for row in rows] == ["gcv:log_mu_min=25", "fixed:mu=1e27 m^(4/3)"]
     assert set(rows[1]["profiles"]) == {"weak", "single"}
-    assert rows[1]["profiles"]["weak"]["log_mu"] == pytest.approx(27)
+    weak = rows[1]["profiles"]["weak"]
+    assert weak["log_mu"] == pytest.approx(27)
+    assert len(weak["errors_map"]) == 2
+    assert np.mean(weak["errors_mean"]) == pytest.approx(weak["error_mean"])
 
 
 def test_documented_row_is_what_comes_out() -> None:
