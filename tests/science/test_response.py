@@ -7,15 +7,19 @@ coordinates of the frequency at the layer, with the transforms of the sources wr
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 from scipy.integrate import cubature, quad, quad_vec
 from scipy.special import gamma
 
+import coslidar.pipeline.response
 from coslidar.pipeline.geometry import MAP_KINDS, Geometry, SliceGrid
 from coslidar.pipeline.response import response, response_matrix
 from coslidar.plugins.source_models import Gaussian, Image, Point
@@ -608,3 +612,61 @@ def test_centroids_of_an_extended_source_by_monte_carlo() -> None:
     expected = full[[0, 1, 4]]
     assert np.allclose(found, expected, rtol=0.06), found / expected
     assert np.all(printed[:2] / expected[:2] > 1.5)
+
+
+# ---------------------------------------------------------------------------------------------------- mutations
+
+
+def mutant(old: str, new: str) -> ModuleType:
+    """Response functions with one line of their source replaced."""
+    source = Path(coslidar.pipeline.response.__file__).read_text()
+    assert source.count(old) == 1, f"{old!r} stands {source.count(old)} times in response.py"
+    module = ModuleType("coslidar.pipeline.mutant")
+    module.__package__ = "coslidar.pipeline"
+    sys.modules[module.__name__] = module
+    exec(compile(source.replace(old, new), "mutant", "exec"), module.__dict__)
+    return module
+
+
+@pytest.fixture(scope="module")
+def brute_force() -> np.ndarray:
+    return BruteForce(SCINDAR, 1446.25, BLURRED, BLURRED).maps(0.07 * np.array(LAGS))
+
+
+def assert_right(module: ModuleType, expected: np.ndarray) -> None:
+    """What the tests above assert of one layer and one slice."""
+    maps = module.response(SCINDAR, 1446.25, KOLMOGOROV, LAMPS)
+    assert_promise(picked(maps, SCINDAR, LAGS), expected, maps)
+    last = SliceGrid((2447.5, 2670.0))
+    both = [module.response_matrix(SCINDAR, last, KOLMOGOROV, LAMPS, sampling=s)[:, 0] for s in ("mean", "midpoint")]
+    assert both[0][4 * 81 + 40] / both[1][4 * 81 + 40] - 1 == pytest.approx(0.34, abs=0.01)
+
+
+MUTATIONS = {
+    "cross maps flipped": ("{_COS_COS: y[0], _SIN_COS: y[1]}", "{_COS_COS: y[0], _SIN_COS: -y[1]}"),
+    "x and y swapped": ("[*slopes, (np.zeros(1)", "[slopes[1], slopes[0], (np.zeros(1)"),
+    "L / (L - z) dropped": (
+        "return scaling**2 * spectrum * measure, np.cos(x)",
+        "return spectrum * measure, np.cos(x)",
+    ),
+    "L / (L - z) dropped in the spectrum": ("psd(float(a) * shell.f)", "psd(shell.f)"),
+    "L / (L - z) dropped in diffraction": ("z[:, None] * scaling * shell.f**2", "z[:, None] * shell.f**2"),
+    "f for 2 pi f": (
+        "return mean, 2 * np.pi * fx * mean, 2 * np.pi * fy * mean",
+        "return mean, fx * mean, fy * mean",
+    ),
+    "k^2 lost": ("(2 * model.wavenumber) * seen", "2 * seen"),
+    "sign of the centroid term": ("(model.centroid_term * mean) * about", "-(model.centroid_term * mean) * about"),
+    "midpoint for mean": ("_slice_integral(model, z0, z1)", "(z1 - z0) * _at(model, (z0 + z1) / 2)"),
+}
+
+
+def test_the_guards_pass_without_mutation(brute_force: np.ndarray) -> None:
+    assert_right(mutant("import itertools\n", "import itertools\n"), brute_force)
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_each_mutation_is_noticed(name: str, brute_force: np.ndarray) -> None:
+    module = mutant(*MUTATIONS[name])
+    with pytest.raises(AssertionError):
+        assert_right(module, brute_force)

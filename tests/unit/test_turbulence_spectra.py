@@ -86,7 +86,7 @@ def test_limits() -> None:
 
 
 def test_inner_scales() -> None:
-    # kappa l0 = 5.92 cuts the Tatarskii spectrum by e. The bump of Hill raises it by a third to a half near kappa l0 = 1.7,
+    # kappa l0 = 5.92 cuts the Tatarskii spectrum by e. The bump of Hill adds a third to a half near kappa l0 = 1.7,
     # and the spectrum is gone at kappa l0 = 10.
     inner = 0.006
     f = np.array([5.92, 1.7, 10.0, 0.01]) / inner / (2 * np.pi)
