@@ -43,8 +43,8 @@ def _shared(draws: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
                     "--sampling", type=click.Choice(["mean", "midpoint"]), default="midpoint", show_default=True,
                     help="Response averaged over a slice or at its middle, of data and inversion alike.",
                 ),
-                click.option("--no-noise", is_flag=True, help="No detection noise, and no unknowns beside the profile (the paper's "
-                             "appendix)."),
+                click.option("--no-noise", is_flag=True, help="No detection noise, and no unknowns beside the "
+                             "profile (the paper's appendix)."),
                 click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text."),
             )
         ):  # fmt: skip
