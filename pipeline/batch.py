@@ -39,6 +39,8 @@ RETRIEVE_VERSION = 2
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
+#: Shortest batch, s, in which a drift is told from slow turbulence.
+DRIFT = 60.0
 
 
 class BatchError(ValueError):
@@ -267,17 +269,18 @@ def reduce(
         ("saturated", float(((flag & extraction.FLAGS["saturated"]) > 0).mean()) > 0.01),
         (
             "irregular_time",
-            stamps.backward > 0 or abs(stamps.rate / frame_rate - 1) > 0.01 or stamps.jitter * frame_rate > 0.1,
+            stamps.backward > 0 or abs(stamps.rate / frame_rate - 1) > 0.01 or stamps.jitter * frame_rate > 0.25,
         ),
         ("repeated_frames", repeated.sum() > 0.01 * frames),
         ("source_out", (out.mean(axis=0) > 0.01).any()),
-        # A line from -a/2 to a/2 has the variance a^2 / 12.
-        ("drifting_spots", (spot_drift**2 / 12 > 0.25 * slope_variance).any()),
-        ("drifting_flux", (flux_drift**2 / 12 > 0.1 * index).any()),
+        # A line from -a/2 to a/2 has the variance a^2 / 12. Over seconds turbulence itself drifts.
+        ("drifting_spots", span >= DRIFT and (spot_drift**2 / 12 > 0.25 * slope_variance).any()),
+        ("drifting_flux", span >= DRIFT and (flux_drift**2 / 12 > 0.1 * index).any()),
         ("vibration", np.isfinite(line.frequency)),
         ("tilt_response", (np.abs(measurements.centroid_gain - 1) > 0.05).any()),
-        ("not_kolmogorov", (modes.misfit > checks.MISFIT).any()),
-        ("not_lognormal", (logarithm.distance > checks.DISTANCE).any()),
+        # Few independent frames leave room for chance.
+        ("not_kolmogorov", (modes.misfit > np.fmax(checks.MISFIT, 2 * np.sqrt(2 / 3 / n_effective[:2].min()))).any()),
+        ("not_lognormal", (logarithm.distance > np.fmax(checks.DISTANCE, 1.5 / np.sqrt(n_effective[2]))).any()),
         ("rytov_limit", (index > checks.RYTOV).any()),
         ("not_stationary", (steady.deviation > np.maximum(checks.UNSTEADY, 4 * steady.error)).any()),
     ):

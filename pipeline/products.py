@@ -193,12 +193,20 @@ QUALITY_FLAGS: dict[str, tuple[int, int, str]] = {
     "irregular_time": (
         512,
         1,
-        "time stamps run backward, scatter by a tenth of a frame, or are 1 % off the frame rate",
+        "time stamps run backward, scatter by a quarter of a frame, or are 1 % off the frame rate",
     ),
     "repeated_frames": (1024, 1, "more than 1 % of the frames repeat the one before; they are left out"),
     "source_out": (2048, 1, "a source is out in more than 1 % of the frames, which are left out"),
-    "drifting_spots": (4096, 1, "a drift of the spots holds more than a quarter of the slope variance of a source"),
-    "drifting_flux": (8192, 1, "a drift of the light holds more than a tenth of the scintillation of a source"),
+    "drifting_spots": (
+        4096,
+        1,
+        "a minute or more in which a drift of the spots holds a quarter of the slope variance of a source",
+    ),
+    "drifting_flux": (
+        8192,
+        1,
+        "a minute or more in which a drift of the light holds a tenth of the scintillation of a source",
+    ),
     "vibration": (16384, 0, "a vibration line is found in the slopes"),
     "tilt_response": (32768, 1, "slopes answer to a known tilt with a gain that is 5 % or more off 1"),
     "not_kolmogorov": (65536, 1, "Zernike variances of radial orders 2 to 5 are not in Kolmogorov's ratio"),

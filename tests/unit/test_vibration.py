@@ -1,0 +1,89 @@
+"""The vibration line: found where it is, with the variance it has, and not where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from coslidar.pipeline.vibration import LOWEST, find_line
+
+RATE = 142.0
+
+
+def tilt(frames: int, seed: int) -> np.ndarray:
+    """Kolmogorov tilt: power as f^(-2/3) up to 2 Hz and f^(-11/3) above (Conan, Rousset and Madec 1995,
+    https://doi.org/10.1364/JOSAA.12.001559), variance 1e-10, cut from a longer record so that its ends do not meet."""
+    random = np.random.default_rng(seed)
+    f = np.fft.rfftfreq(20 * frames, 1 / RATE)
+    f[0] = np.inf
+    amplitude = np.sqrt(np.where(f < 2, (f / 2) ** (-2 / 3), (f / 2) ** (-11 / 3)))
+    noise = random.standard_normal((len(f), 2)) + 1j * random.standard_normal((len(f), 2))
+    values = np.fft.irfft(noise * amplitude[:, None], 20 * frames, axis=0)[:frames]
+    return 1e-5 * values / values.std(axis=0) + 5e-8 * random.standard_normal((frames, 2))
+
+
+def line(frames: int, frequency: float, variance: tuple[float, float]) -> np.ndarray:
+    phase = 2 * np.pi * frequency * np.arange(frames) / RATE
+    return np.sqrt(2 * np.array(variance)) * np.sin(phase[:, None] + [0.3, 1.1])
+
+
+@pytest.mark.parametrize("frames", [700, 2800, 25_560])
+@pytest.mark.parametrize("frequency", [17.3, 50.0, 66.0])
+def test_frequency_and_variance_of_a_line(frames: int, frequency: float) -> None:
+    """Sidelobes beyond the band hold 1 / (pi^2 half width x duration), 1 % of 5 s."""
+    variance = (1e-12, 4e-12)
+    found = find_line(tilt(frames, 1) + line(frames, frequency, variance), RATE)
+    assert found.frequency == pytest.approx(frequency, abs=0.1)
+    # Line and continuum interfere: at 17 Hz by 2 sqrt(1e-12 x 4e-16), 4e-14, for 2800 frames and twice that for 700.
+    assert found.variance == pytest.approx(variance, rel=0.03, abs=1.5e-13 if frequency < 20 else 0)
+    assert found.significance > 20
+
+
+def test_line_above_half_the_rate_shows_at_its_alias() -> None:
+    found = find_line(tilt(2800, 2) + line(2800, 100.0, (2e-12, 2e-12)), RATE)
+    assert found.frequency == pytest.approx(RATE - 100.0, abs=0.05)
+    assert found.variance == pytest.approx([2e-12, 2e-12], rel=0.03)
+
+
+def test_wandering_phase() -> None:
+    """A phase that walks makes a Lorentzian of half width g: (2 / pi) arctan(2 Hz / g) of it within 2 Hz, less what the
+    wings add to the level beside: arctan(4 Hz / g) - arctan(2 Hz / g)."""
+    random = np.random.default_rng(3)
+    frames, g = 25_560, 0.1
+    walk = np.cumsum(random.normal(0, np.sqrt(4 * np.pi * g / RATE), frames))
+    phase = 2 * np.pi * 50.0 * np.arange(frames) / RATE + walk
+    shaken = np.sqrt(2 * 4e-12) * np.sin(phase)
+    found = find_line(tilt(frames, 3) + shaken[:, None], RATE)
+    inside, beside = np.arctan(2 / g), np.arctan(4 / g) - np.arctan(2 / g)
+    wanted = 4e-12 * 2 / np.pi * (inside - beside)
+    assert found.variance == pytest.approx([wanted, wanted], rel=0.02)
+    assert found.frequency == pytest.approx(50.0, abs=0.2)
+
+
+def test_lost_frames_weaken_nothing() -> None:
+    """One frame in ten, and a second in one piece."""
+    frames = 2800
+    values = tilt(frames, 4) + line(frames, 50.0, (1e-12, 4e-12))
+    values[np.random.default_rng(4).random(frames) < 0.1] = np.nan
+    values[1000:1142] = np.nan
+    found = find_line(values, RATE)
+    assert found.frequency == pytest.approx(50.0, abs=0.1)
+    # Straight lines over holes of single frames keep part of the line: not all of what is lost is made up for.
+    assert found.variance == pytest.approx([1e-12, 4e-12], rel=0.15)
+
+
+def test_turbulence_alone_has_no_line() -> None:
+    """A chance of 1e-6 a record, were the spectrum flat within 3 Hz; 200 records."""
+    for seed in range(200):
+        found = find_line(tilt(1400, 100 + seed), RATE)
+        assert np.isnan(found.frequency), seed
+        assert (found.variance == 0).all()
+
+
+def test_records_that_cannot_tell() -> None:
+    for values, rate in ((tilt(100, 1), RATE), (tilt(1000, 1), 2 * LOWEST), (np.full((1000, 2), np.nan), RATE)):
+        found = find_line(values, rate)
+        assert np.isnan(found.frequency)
+        assert np.isnan(found.significance)
+        assert (found.variance == 0).all()
+    assert np.isnan(find_line(np.zeros((1000, 2)), RATE).frequency)
