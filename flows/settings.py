@@ -45,9 +45,15 @@ PRESETS: dict[str, dict[str, Any]] = {
     "sauvage-2021": {
         "batch": {"duration": "3 min"},
         "extraction": {"method": "moving_maximum"},
-        "correlation": {"covariance": "independent"},
+        "correlation": {"covariance": "independent", "vibration": "subtracted"},
         "response": {"slices": 12, "sampling": "midpoint", "slope_response": "printed"},
-        "inversion": {"estimator": "map", "subset": "all", "noise_bias": "joint", "slope_offset": "joint"},
+        "inversion": {
+            "estimator": "map",
+            "subset": "all",
+            "noise_bias": "joint",
+            "flux_noise": "joint",
+            "slope_offset": "none",
+        },
         "source": {"name": "gaussian"},
         "spectrum": {"name": "kolmogorov"},
         "regulariser": {"name": "white"},

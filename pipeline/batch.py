@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 2
 RESPONSE_VERSION = 1
-RETRIEVE_VERSION = 2
+RETRIEVE_VERSION = 3
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
@@ -476,18 +476,24 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
 
 def _known(reduced: ReducedBatch, model: Model) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Data vector and precision of the prior."""
-    return correlation.data_vector(reduced.arrays["maps"]), model.regulariser.precision(model.grid)
+    maps = reduced.arrays["maps"]
+    if model.inversion.noise_bias == "joint" and model.inversion.flux_noise == "measured":
+        maps = maps.copy()
+        centre = (maps.shape[1] // 2, maps.shape[2] // 2)
+        maps[(MAP_KINDS.index("ii_auto"), *centre)] -= reduced.arrays["noise_variance_intensity_detector"].mean()
+    return correlation.data_vector(maps), model.regulariser.precision(model.grid)
 
 
 def _whitened(reduced: ReducedBatch, model: Model) -> inversion.Reduction:
     """Whitening for the noise of a batch."""
+    unknown = {"none": "", "joint": "xy" if model.inversion.flux_noise == "measured" else "xyi"}
     return inversion.prepare(
         correlation.data_vector(reduced.arrays["maps"]),
         reduced.arrays["noise_covariance"],
         model.matrix,
         rows=model.geometry.independent,
         subset=model.inversion.subset,
-        noise_bias=model.inversion.noise_bias == "joint",
+        noise_bias=unknown[model.inversion.noise_bias],
         slope_offset=model.inversion.slope_offset == "joint",
     )
 

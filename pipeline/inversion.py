@@ -219,7 +219,7 @@ def independent_rows(data: ArrayLike, covariance: ArrayLike, matrix: ArrayLike) 
 
 
 def nuisance_design(
-    n_rows: int, *, noise_bias: bool = True, slope_offset: bool = True
+    n_rows: int, *, noise_bias: bool | str = True, slope_offset: bool = True
 ) -> tuple[Floats, tuple[str, ...]]:
     """Design matrix of the unpenalised unknowns that are estimated jointly with the profile.
 
@@ -239,8 +239,10 @@ def nuisance_design(
     ----------
     n_rows : int
         Length of the data vector, six blocks of (2p-1) (2q-1); the zero separation is the centre of a block.
-    noise_bias, slope_offset : bool
-        Which unknowns to include.
+    noise_bias : bool or str
+        Whether to include the noise of all kinds, or the kinds among ``"xyi"``.
+    slope_offset : bool
+        Whether to include the constants.
 
     Returns
     -------
@@ -256,8 +258,9 @@ def nuisance_design(
     """
     columns: dict[str, Floats] = {}
     length = block_length(n_rows) if noise_bias or slope_offset else 0
-    if noise_bias:
-        for name, block in _NOISE_BLOCKS.items():
+    kinds = noise_bias if isinstance(noise_bias, str) else "xyi" if noise_bias else ""
+    for name, block in _NOISE_BLOCKS.items():
+        if name[-1] in kinds:
             columns[name] = np.zeros(n_rows)
             columns[name][block * length + length // 2] = 1.0
     if slope_offset:
@@ -469,7 +472,7 @@ def prepare(
     *,
     rows: ArrayLike | None = None,
     subset: str = "all",
-    noise_bias: bool = True,
+    noise_bias: bool | str = True,
     slope_offset: bool = True,
 ) -> Reduction:
     """Choose rows, whiten them and eliminate the unpenalised unknowns.
@@ -1181,7 +1184,7 @@ def invert(
     selector: HyperparameterSelector,
     rows: ArrayLike | None = None,
     subset: str = "all",
-    noise_bias: bool = True,
+    noise_bias: bool | str = True,
     slope_offset: bool = True,
     neighbours: Sequence[LinearProblem] = (),
     estimator: Estimator = "map",

@@ -135,6 +135,10 @@ class InversionParameters(Parameters):
     """Part of the correlation maps that is used."""
     noise_bias: Literal["joint", "none"] = "joint"
     """Detection noise on the zero separation of each auto-correlation map."""
+    flux_noise: Literal["measured", "joint"] = "measured"
+    """Where `noise_bias` is `joint`, that of the fluxes: `measured` from dark pixels and photons and subtracted, or one
+    more unknown. It is known to a few per cent, while as an unknown it takes up whatever else distinguishes the zero
+    separation, the most informative datum of the scintillation."""
     slope_offset: Literal["joint", "none"] = "joint"
     """One constant per slope axis: vibration, finite record, wind shake."""
 

@@ -41,7 +41,8 @@ duration = "{duration}"             # averaging window of one profile
 [inversion]
 # estimator = "map"                 # most probable profile; or "posterior_mean"
 # subset = "all"                    # or "slopes", "scintillation", "auto", "cross"
-# noise_bias = "joint"              # or "none"
+# noise_bias = "joint"              # detection noise as an unknown; or "none"
+# flux_noise = "measured"           # that of the fluxes from dark pixels and photons; or "joint"
 # slope_offset = "joint"            # or "none"
 
 # Plugins: 'coslidar plugins ls' lists them, 'coslidar plugins describe NAME' shows their parameters.
@@ -181,13 +182,28 @@ def simulate(scenario: str, output: Path, duration: str | None, seed: int | None
 @click.command()
 @click.argument("archive")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def inspect(archive: str, as_json: bool) -> None:
+@click.option("--find-grid", is_flag=True, help="Find lenslets and spots, also on an image (FITS, HDF5, TIFF, ...).")
+@click.option(
+    "--header", type=click.Path(path_type=Path), help="With --find-grid: file whose [ingest] tells how to read."
+)
+@click.option(
+    "-o", "--overlay", type=click.Path(path_type=Path), help="With --find-grid: picture of it (png, svg, pdf)."
+)
+def inspect(archive: str, as_json: bool, find_grid: bool, header: Path | None, overlay: Path | None) -> None:
     """Show what the raw archive ARCHIVE (folder, .zip or URL) holds.
 
-    An archive that is not sound is refused with every fault it has.
+    An archive that is not sound is refused with every fault it has. With --find-grid it prints the part of a header
+    that describes the lenslets and spots on the mean frame of an archive, or of images that are none yet.
     """
     import json
 
+    if find_grid:
+        from .ingest import find_grid as find
+
+        find(archive, header, overlay, as_json)
+        return
+    if header is not None or overlay is not None:
+        raise click.UsageError("--header and --overlay go with --find-grid")
     from ...catalog.archive import describe, notes, open_archive
 
     opened = open_archive(archive)

@@ -1,0 +1,246 @@
+"""Dask clusters of somebody else: by address, by scheduler file, with faults."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import psutil
+import pytest
+from small_runs import ARCHIVES, BATCHES, SETTINGS, Finished, environment, family, products, run_arguments, wait_for
+
+from coslidar.catalog import open_catalog
+from coslidar.flows import cluster
+from coslidar.flows.run import run
+from coslidar.flows.settings import RunParameters, Unavailable, load
+
+TOTAL = len(ARCHIVES) * BATCHES
+Call = Callable[..., Finished]
+
+
+class Cluster:
+    """A scheduler and its workers, each a process."""
+
+    def __init__(self, folder: Path, cache: Path) -> None:
+        self.folder, self.cache = folder, cache
+        self.processes: list[subprocess.Popen[bytes]] = []
+        self.file = folder / "scheduler.json"
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+        self.scheduler = self.start(
+            "scheduler", "--host", "127.0.0.1", "--port", self.address.rsplit(":", 1)[1], "--no-dashboard",
+            "--scheduler-file", str(self.file),
+        )  # fmt: skip
+        assert wait_for(self.file.exists, 60)
+
+    def start(self, what: str, *arguments: str) -> subprocess.Popen[bytes]:
+        log = (self.folder / f"{what}-{len(self.processes)}.log").open("wb")
+        process = subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli.dask_" + what, *arguments],
+            stdout=log,
+            stderr=log,
+            cwd=self.folder,
+            env=environment(self.cache, OMP_NUM_THREADS="1"),
+        )
+        log.close()
+        self.processes.append(process)
+        return process
+
+    def worker(self, *arguments: str) -> subprocess.Popen[bytes]:
+        return self.start(
+            "worker", self.address, "--host", "127.0.0.1", "--no-dashboard", "--nworkers", "1", "--nthreads", "1",
+            *arguments,
+        )  # fmt: skip
+
+    def close(self) -> None:
+        for process in self.processes:
+            for one in family(process.pid):
+                one.kill()
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def dask(tmp_path: Path, cache: Path) -> Iterator[Cluster]:
+    """A scheduler without workers."""
+    folder = tmp_path / "dask"
+    folder.mkdir()
+    made = Cluster(folder, cache)
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
+    """Products of a run on this machine."""
+    out = tmp_path_factory.mktemp("local")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COSLIDAR_HOME", str(cache))
+        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
+    return products(out)
+
+
+@pytest.mark.cluster
+def test_by_address_and_by_file(
+    dask: Cluster, coslidar: Call, recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    dask.worker("--no-nanny")
+    dask.worker("--no-nanny")
+    for number, scheduler in enumerate((dask.address, dask.file)):
+        out = tmp_path / str(number)
+        done = coslidar(*run_arguments(recordings, out, "--scheduler", scheduler))
+        assert done.code == 0, done.err
+        assert products(out) == undisturbed
+        assert "3 of 3 archives" in done.out
+        assert len(done.err.splitlines()) == 4, done.err
+    # The cluster is not ours to stop.
+    assert all(process.poll() is None for process in dask.processes)
+
+
+@pytest.mark.cluster
+def test_a_worker_that_dies_costs_nothing_but_its_batch(
+    dask: Cluster,
+    started: Callable[..., subprocess.Popen[str]],
+    recordings: list[str],
+    undisturbed: dict[str, bytes],
+    tmp_path: Path,
+) -> None:
+    first, second = dask.worker("--no-nanny"), dask.worker("--no-nanny")
+    out = tmp_path / "out"
+    process = started(*run_arguments(recordings, out, "--scheduler", dask.address))
+    assert wait_for(lambda: any((out / "correlations").glob("??/*.npz")) or process.poll() is not None, 120)
+    assert process.poll() is None, process.communicate()
+    first.kill()
+    _, err = process.communicate(timeout=120)
+    assert process.returncode == 0, err
+    assert second.poll() is None
+    assert products(out) == undisturbed
+    assert f"{TOTAL} batches computed" in err
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_a_scheduler_that_dies_is_named_and_the_run_goes_on_elsewhere(
+    dask: Cluster,
+    started: Callable[..., subprocess.Popen[str]],
+    coslidar: Call,
+    recordings: list[str],
+    undisturbed: dict[str, bytes],
+    tmp_path: Path,
+) -> None:
+    dask.worker("--no-nanny")
+    out = tmp_path / "out"
+    process = started(*run_arguments(recordings, out, "--scheduler", dask.address))
+    assert wait_for(lambda: any((out / "correlations").glob("??/*.npz")) or process.poll() is not None, 120)
+    assert process.poll() is None, process.communicate()
+    dask.scheduler.kill()
+    begin = time.monotonic()
+    _, err = process.communicate(timeout=180)
+    assert process.returncode == 1, err
+    assert time.monotonic() - begin < 90
+    assert "Traceback" not in err
+    assert "the Dask scheduler was lost" in err
+    assert all(line.startswith("coslidar: ") for line in err.splitlines()), err
+    with open_catalog(out) as catalog:
+        assert [made.state for made in catalog.runs()] == ["failed"]
+    again = coslidar(*run_arguments(recordings, out))
+    assert again.code == 0, again.err
+    assert products(out) == undisturbed
+
+
+@pytest.mark.cluster
+def test_a_worker_that_cannot_see_the_archive_is_no_fault_of_the_data(
+    dask: Cluster, recordings: list[str], tmp_path: Path
+) -> None:
+    # As on a cluster without a common file system: the path exists here only.
+    dask.worker("--no-nanny", "--preload", str(_blind(tmp_path)))
+    settings = load(archives=recordings[:1], output=tmp_path / "out", assignments=SETTINGS, scheduler=dask.address)
+    (outcome,) = run(settings, prefect=False)
+    assert (outcome.status, outcome.input_fault) == ("failed", False)
+    assert all("cannot open the archive" in fault and "there is no such file" in fault for fault in outcome.faults)
+    (here,) = run(load(archives=recordings[:1], output=tmp_path / "out", assignments=SETTINGS), prefect=False)
+    assert (here.status, here.failed_batches) == ("published", 0)
+
+
+def _blind(folder: Path) -> Path:
+    path = folder / "blind.py"
+    path.write_text(
+        "from coslidar.flows import cluster\n"
+        "real = cluster.open_archive\n"
+        "cluster.open_archive = lambda url, **options: real(url + '.elsewhere', **options)\n"
+    )
+    return path
+
+
+def test_no_scheduler(coslidar: Call, recordings: list[str], tmp_path: Path) -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+        done = coslidar(*run_arguments(recordings, tmp_path / "out", "--scheduler", address))
+    assert done.code == 1
+    (line,) = done.err.splitlines()
+    assert f"no Dask scheduler answers at {address}" in line
+    assert "dask scheduler" in line
+
+
+@pytest.mark.parametrize("scheduler", ["nonsense", "tcp://", "there/is/no/file.json", "tcp://127.0.0.1:notaport"])
+def test_what_is_no_address(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cluster, "PATIENCE", 1)
+    with (
+        pytest.raises(Unavailable, match="no Dask scheduler answers"),
+        cluster.connect(RunParameters(scheduler=scheduler)),
+    ):
+        pass
+
+
+class FakeClient:
+    """A client whose workers have other versions, or are not there."""
+
+    def __init__(self, changes: dict[str, dict[str, str]], *, present: bool = True) -> None:
+        self.changes, self.present = changes, present
+        self.scheduler = SimpleNamespace(address="tcp://10.0.0.1:8786")
+
+    def wait_for_workers(self, count: int, timeout: float) -> None:
+        if not self.present:
+            raise TimeoutError
+
+    def run(self, function: Callable[[], dict[str, str]]) -> dict[str, Any]:
+        if "broken" in self.changes:
+            raise ModuleNotFoundError("No module named 'coslidar'")
+        return {worker: {**function(), **change} for worker, change in self.changes.items()}
+
+
+def test_versions_are_compared_and_both_named() -> None:
+    mine = cluster._versions()
+    cluster.check_workers(FakeClient({"tcp://a:1": {}, "tcp://b:1": {}}), "tcp://x")  # type: ignore[arg-type]
+    with pytest.raises(Unavailable) as error:
+        cluster.check_workers(
+            FakeClient({"tcp://a:1": {}, "tcp://b:1": {"numpy": "1.26.0", "python": "3.14.1"}}),  # type: ignore[arg-type]
+            "tcp://x",
+        )
+    text = str(error.value)
+    assert f"numpy is 1.26.0 on worker tcp://b:1 and {mine['numpy']} here" in text
+    assert f"python is 3.14.1 on worker tcp://b:1 and {mine['python']} here" in text
+    assert "tcp://a:1" not in text
+    assert "same environment" in text
+
+
+def test_a_cluster_without_workers_or_without_coslidar_is_refused() -> None:
+    with pytest.raises(Unavailable, match=r"has no worker; start some with 'dask worker tcp://10\.0\.0\.1:8786'"):
+        cluster.check_workers(FakeClient({}, present=False), "x")  # type: ignore[arg-type]
+    with pytest.raises(Unavailable, match=r"cannot run coslidar .*No module named 'coslidar'"):
+        cluster.check_workers(FakeClient({"broken": {}}), "x")  # type: ignore[arg-type]
+
+
+def test_a_local_cluster_listens_nowhere_else() -> None:
+    with cluster.connect(RunParameters(threads=1)) as client:
+        assert client.scheduler.address.startswith("inproc://")
+        heard = {c.laddr.ip for c in psutil.Process().net_connections("inet") if c.status == psutil.CONN_LISTEN}
+        assert heard <= {"127.0.0.1"}
