@@ -272,7 +272,7 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
         archive_identity=plan.archive.identity,
         lineage=plan.profile_key,
         wavelength=header.instrument.wavelength,
-        sources=[source.name for source in header.sources],
+        sources=plan.source_names,
         attributes=attributes_of(plan, work.settings),
     )
     published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes)
@@ -299,6 +299,7 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
         "sampling": parameters.response.sampling,
         "slope_response": parameters.response.slope_response,
         "covariance": parameters.correlation.covariance,
+        "sources_used": parameters.correlation.sources,
         "source_model": settings.plugins["source"]["name"],
         "spectrum": settings.plugins["spectrum"]["name"],
         "regulariser": settings.plugins["regulariser"]["name"],

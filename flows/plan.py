@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from ..catalog.archive import open_archive
 from ..pipeline import batch as stages
 from ..pipeline.lineage import Key, checkout, make_key
+from ..pipeline.parameters import SOURCES_USED
 from ..pipeline.units import safe
 from .settings import InputError
 
@@ -64,7 +65,9 @@ class ArchivePlan:
     grid : SliceGrid
         Slices of the profile.
     sources, spectrum, regulariser, selector
-        Plugins.
+        Plugins; as many source models as sources are used.
+    source_names : tuple of str
+        Names of the sources that are used.
     windows : tuple of BatchWindow
         Batches.
     reduction_key, response_key, profile_key : Key
@@ -77,6 +80,7 @@ class ArchivePlan:
     geometry: Geometry
     grid: SliceGrid
     sources: tuple[SourceModelBase, ...]
+    source_names: tuple[str, ...]
     spectrum: TurbulenceSpectrumBase
     regulariser: RegulariserBase
     selector: HyperparameterSelectorBase
@@ -168,13 +172,18 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
                 f"'{settings.campaign}'; leave this archive out, or process it under a campaign file of its own"
             ]
         )
-    geometry = header.geometry()
     configuration = settings.configuration
+    geometry = header.geometry()
+    used = SOURCES_USED[configuration.correlation.sources][: geometry.n_sources]
+    if max(used) >= geometry.n_sources:
+        raise InputError([f"{origin}: correlation.sources = 'second': this recording has one source; write 'both'"])
+    geometry = replace(geometry, positions=tuple(geometry.positions[number] for number in used))
     try:
         grid = configuration.response.grid(geometry)
     except ValueError as error:
         raise InputError([f"{settings.origin}: {error}"]) from error
-    sources = settings.source_models(header, origin)
+    models = settings.source_models(header, origin)
+    sources = tuple(models[number] for number in used)
     spectrum, regulariser, selector = settings.spectrum(), settings.regulariser(), settings.selector()
 
     mark = checkout().mark
@@ -236,6 +245,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         geometry=geometry,
         grid=grid,
         sources=sources,
+        source_names=tuple(header.sources[number].name for number in used),
         spectrum=spectrum,
         regulariser=regulariser,
         selector=selector,

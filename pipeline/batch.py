@@ -15,6 +15,7 @@ import numpy as np
 
 from . import checks, convergence, correlation, extraction, inversion, noise, posterior, timing, turbulence, vibration
 from .geometry import MAP_KINDS
+from .parameters import SOURCES_USED
 from .products import INTENSITY_KINDS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
@@ -212,6 +213,8 @@ def reduce(
     frames = len(measurements.time)
     if frames < MIN_FRAMES:
         raise BatchError(f"{frames} frames are too few for correlations; at least {MIN_FRAMES} are needed")
+    if geometry.n_sources == 1 and measurements.flux.shape[1] == 2:
+        measurements = measurements.of_source(SOURCES_USED[parameters.sources][0])
     slopes, flux, flag = measurements.slopes, measurements.flux, measurements.flag
     repeated = timing.repeated(slopes, flux)
     if repeated.sum() > 0.5 * frames:

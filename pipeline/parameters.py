@@ -83,9 +83,16 @@ class ExtractionParameters(Parameters):
     """Frames at the start of a batch whose mean gives the fine position of the spots."""
 
 
-class CorrelationParameters(Parameters):
-    """How the noise of the correlation maps is estimated."""
+#: Sources whose data are used -> their places in the header.
+SOURCES_USED = {"both": (0, 1), "first": (0,), "second": (1,)}
 
+
+class CorrelationParameters(Parameters):
+    """What is correlated, and how the noise of the correlation maps is estimated."""
+
+    sources: Literal["both", "first", "second"] = "both"
+    """Sources whose data are used. With one there is no triangulation: the profile rests on the shape of the
+    scintillation."""
     covariance: Literal["lagged", "independent"] = "lagged"
     """`lagged`: frames correlated in time, as they are; `independent`: as if no frame knew of the next
     (Sauvage et al. 2021)."""

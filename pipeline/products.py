@@ -38,6 +38,19 @@ class Measurements:
     slope_noise: NDArray[np.float64]
     centroid_gain: NDArray[np.float64]
 
+    def of_source(self, number: int) -> Measurements:
+        """Those of one source, as if it were the only one."""
+        one = slice(number, number + 1)
+        return Measurements(
+            self.time,
+            self.slopes[:, :, one],
+            self.flux[:, one],
+            self.flag[:, one],
+            self.flux_noise[one],
+            self.slope_noise[:, one],
+            self.centroid_gain[:, one],
+        )
+
 
 @dataclass(frozen=True)
 class Variable:

@@ -1,8 +1,9 @@
 """The whole chain on the wave-optics recording, against its truth.
 
 The record lasts 19.7 s. Its truth file counts 537 effectively independent samples per subaperture for scintillation,
-163 for x slopes and 97 for y slopes. A variance from n samples has a relative error of sqrt(2/n): 6 % for one subaperture's
-scintillation (averaged over the pupil, some 2 to 3 %), 11 and 14 % for slopes. Tolerances below follow from these.
+163 for x slopes and 97 for y slopes. A variance from n samples has a relative error of sqrt(2/n): 6 % for the
+scintillation of one subaperture (averaged over the pupil, some 2 to 3 %), 11 and 14 % for slopes. Tolerances below follow
+from these.
 """
 
 from __future__ import annotations
@@ -78,3 +79,23 @@ def test_strong_scintillation_is_said(product: Any) -> None:
     assert 0.4 < float(product["scintillation_index_point"]) < 1.0
     assert int(product["quality_flag"]) & QUALITY_FLAGS["strong_scintillation"][0]
     assert int(product["quality_flag"]) & QUALITY_FLAGS["short"][0]
+
+
+@pytest.mark.parametrize(("used", "number", "name"), [("first", 0, "bottom"), ("second", 1, "top")])
+def test_one_source_alone(
+    shared_sample: Path, shared_truth: dict[str, Any], tmp_path: Path, used: str, number: int, name: str
+) -> None:
+    """Its own index, no cross map, and a profile whose index agrees within the same 10 %."""
+    settings = load(
+        archives=[str(shared_sample)],
+        output=tmp_path,
+        assignments=["response.sampling=midpoint", f"correlation.sources={used}"],
+    )
+    (outcome,) = run(settings, prefect=False)
+    found = open_product(outcome.product).isel(time=0)
+    truth = shared_truth["sigma_I2"]["of_this_record_per_source"][number]
+    assert found["source"].values.tolist() == [name]
+    assert found.attrs["sources_used"] == used
+    assert found["scintillation_index_direct"].values == pytest.approx([truth], rel=0.05)
+    assert float(found["scintillation_index_profile"]) == pytest.approx(truth, rel=0.10)
+    assert np.isnan(found["intensity_correlation"].sel(intensity_kind="ii_cross")).all()
