@@ -18,6 +18,7 @@ import numpy as np
 from ..catalog.archive import ArchiveError, ChunkError, open_archive
 from ..pipeline import batch as stages
 from ..pipeline.extraction import Calibration
+from ..pipeline.units import safe
 from .settings import Unavailable
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
     from ..pipeline.products import BatchResult
     from .plan import BatchWindow
     from .settings import RunParameters
+
+log = logging.getLogger("coslidar")
 
 #: A batch that has been lost with its worker more often than this is taken for poison.
 ALLOWED_FAILURES = 3
@@ -138,10 +141,11 @@ def remember(archive: Archive) -> None:
 def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
     """Frames to profile, on a worker.
 
-    What the data forbid becomes a failed result with its reason; anything else is raised.
+    Never raises: what the data forbid becomes a failed result with its reason, and so does what goes wrong with the
+    machine, which another try may mend. Exceptions do not travel: not all can, and one that cannot hangs the run.
     """
     reduced, new, window = task.reduced, None, task.window
-    lasting = True
+    lasting, transient = True, False
     try:
         if reduced is None:
             archive = _archive(task.url, task.identity, task.complete)
@@ -166,14 +170,20 @@ def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
                 task.correlation,
             )
         result = stages.retrieve(reduced, model)
-    except ArchiveError as error:
-        # The driver could open it.
-        raise RuntimeError(f"the worker on {gethostname()} cannot open the archive: {error}") from error
     except (stages.BatchError, ChunkError) as error:
         lasting = isinstance(error, stages.BatchError)
         result = stages.failed(window.start_time, window.stop_time, str(error))
+    except Exception as error:
+        log.debug("batch %s of %s failed", window.index, task.url, exc_info=True)
+        lasting, transient = False, True
+        # The driver could open it.
+        what = (
+            "the archive cannot be opened there: " if isinstance(error, ArchiveError) else f"{type(error).__name__}: "
+        )
+        reason = f"worker on {gethostname()}: {what}{safe(str(error))}"
+        result = stages.failed(window.start_time, window.stop_time, reason)
     read = 0 if task.reduced is not None else window.stop - window.start
-    return BatchOutcome(window, result, new, read, lasting=lasting)
+    return BatchOutcome(window, result, new, read, transient=transient, lasting=lasting)
 
 
 def _settings() -> dict[str, Any]:

@@ -164,17 +164,19 @@ def test_a_worker_that_cannot_see_the_archive_is_no_fault_of_the_data(
     settings = load(archives=recordings[:1], output=tmp_path / "out", assignments=SETTINGS, scheduler=dask.address)
     (outcome,) = run(settings, prefect=False)
     assert (outcome.status, outcome.input_fault) == ("failed", False)
-    assert all("cannot open the archive" in fault and "there is no such file" in fault for fault in outcome.faults)
+    assert all(
+        "archive cannot be opened there" in fault and "there is no such file" in fault for fault in outcome.faults
+    )
     (here,) = run(load(archives=recordings[:1], output=tmp_path / "out", assignments=SETTINGS), prefect=False)
-    assert (here.status, here.failed_batches) == ("published", 0)
+    assert (here.status, here.faults) == ("published", ())
 
 
 def _blind(folder: Path) -> Path:
     path = folder / "blind.py"
     path.write_text(
         "from coslidar.flows import cluster\n"
-        "real = cluster.open_archive\n"
-        "cluster.open_archive = lambda url, **options: real(url + '.elsewhere', **options)\n"
+        "from coslidar.catalog.archive import open_archive\n"
+        "cluster.open_archive = lambda url, **options: open_archive(url + '.elsewhere', **options)\n"
     )
     return path
 
@@ -244,3 +246,24 @@ def test_a_local_cluster_listens_nowhere_else() -> None:
         assert client.scheduler.address.startswith("inproc://")
         heard = {c.laddr.ip for c in psutil.Process().net_connections("inet") if c.status == psutil.CONN_LISTEN}
         assert heard <= {"127.0.0.1"}
+
+
+def test_what_goes_wrong_on_a_worker_does_not_travel(
+    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Unpicklable(Exception):
+        def __reduce__(self) -> Any:
+            raise TypeError("not me")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise Unpicklable("boom")
+
+    settings = load(archives=recordings[:1], output=tmp_path, assignments=SETTINGS)
+    with monkeypatch.context() as patch:
+        patch.setattr(cluster.stages, "retrieve", fail)
+        (outcome,) = run(settings, prefect=False)
+    assert (outcome.status, outcome.input_fault) == ("failed", False)
+    assert all("Unpicklable: boom" in fault for fault in outcome.faults)
+    # What was computed before it is kept, the failure is not.
+    (again,) = run(settings, prefect=False)
+    assert (again.status, again.frames_read, again.faults) == ("published", 0, ())
