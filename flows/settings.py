@@ -233,18 +233,16 @@ def _set(table: dict[str, Any], assignment: str) -> None:
 
 def _expand(patterns: Iterable[str], folder: Path, origin: str, faults: list[str]) -> tuple[str, ...]:
     found: dict[str, None] = {}
-    for pattern in patterns:
+    given = list(patterns)
+    for pattern in given:
         if _URL.match(pattern):
             found[pattern] = None
-            continue
-        path = str(folder / pattern)
-        if any(character in pattern for character in "*?["):
-            matches = sorted(glob(path))
-            if not matches:
-                faults.append(f"{origin}: archives = {pattern!r}: no file or folder matches; looked in {folder}")
-            found.update(dict.fromkeys(matches))
+        elif any(character in pattern for character in "*?["):
+            found.update(dict.fromkeys(sorted(glob(str(folder / pattern)))))
         else:
-            found[path] = None
+            found[str(folder / pattern)] = None
+    if given and not found:
+        faults.append(f"{origin}: archives = {given!r}: no file or folder matches; looked in {safe(str(folder))}")
     return tuple(found)
 
 
