@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 COMMANDS = {
     "init": ("start", "Write a campaign file to begin with, or a whole simulated example."),
     "inspect": ("start", "Show what a raw archive holds, and every fault it has."),
+    "ingest": ("ingest", "Make a raw archive of FITS, HDF5, NumPy, TIFF or raw binary files."),
     "simulate": ("start", "Make recordings whose truth is known."),
     "plan": ("process", "Show what a run would read, compute and reuse."),
     "run": ("process", "Turn recordings into catalogued Cn2 profiles."),

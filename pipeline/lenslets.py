@@ -213,8 +213,7 @@ def find_grid(
     for scale in SCALES:
         if 8 * scale > min(picture.shape):
             break
-        band = ndimage.gaussian_filter(picture, scale) - ndimage.gaussian_filter(picture, OUTER * scale)
-        points, height = _peaks(band, scale, max(SIGNIFICANT * noise * _gain(scale), 1e-9 * spread))
+        points, height = _peaks(_band(picture, scale), scale, max(SIGNIFICANT * noise * _gain(scale), 1e-9 * spread))
         most = max(most, len(points))
         for count in _counts(height):
             if best is not None and count <= best.score:
@@ -227,7 +226,7 @@ def find_grid(
             raise NoGrid(f"only {most} spots stand out of the noise; a grid needs {MIN_SPOTS}")
         found = 0 if best is None else round(100 * best.regular)
         raise NoGrid(f"{most} spots stand out, but no regular grid joins them (at best {found} % of them); no grid")
-    return _measured(picture, best, illuminated)
+    return _measured(picture, best, noise, illuminated)
 
 
 def boxes(grid: LensletGrid, frame_shape: tuple[int, int]) -> Boxes:
@@ -351,13 +350,18 @@ def _noise(picture: Floats) -> float:
     return float(np.median(np.concatenate(steps))) * 1.4826 / math.sqrt(2)
 
 
+def _band(picture: Floats, scale: float) -> Floats:
+    """What a picture shows between two widths."""
+    band: Floats = ndimage.gaussian_filter(picture, scale) - ndimage.gaussian_filter(picture, OUTER * scale)
+    return band
+
+
 def _gain(scale: float) -> float:
     """Standard deviation behind a band-pass of white noise of standard deviation 1."""
     size = 2 * math.ceil(5 * OUTER * scale) + 1
     point = np.zeros((size, size))
     point[size // 2, size // 2] = 1
-    kernel = ndimage.gaussian_filter(point, scale) - ndimage.gaussian_filter(point, OUTER * scale)
-    return float(np.sqrt((kernel**2).sum()))
+    return float(np.sqrt((_band(point, scale) ** 2).sum()))
 
 
 def _peaks(band: Floats, scale: float, floor: float) -> tuple[Floats, Floats]:
@@ -571,7 +575,7 @@ def _circular_mean(phase: Floats) -> Floats:
 # --- what the grid shows -----------------------------------------------------------------------------------
 
 
-def _measured(picture: Floats, net: _Net, illuminated: float) -> LensletGrid:
+def _measured(picture: Floats, net: _Net, noise: float, illuminated: float) -> LensletGrid:
     """Spots, mask and shape of the spots of a grid."""
     vectors = net.vectors
     offsets = np.vstack([np.zeros((1, 2)), net.offsets])
@@ -591,34 +595,32 @@ def _measured(picture: Floats, net: _Net, illuminated: float) -> LensletGrid:
     places = centre + index @ vectors + offsets[:, None, None]
     inside = ((places > 0) & (places < np.array(picture.shape) - 1)).all(axis=-1)
     apart = min(np.hypot(*vectors.T).min(), np.inf if len(offsets) == 1 else np.hypot(*(offsets[1] - offsets[0])))
-    distance, nearest = cKDTree(net.points).query(places, distance_upper_bound=max(0.4 * apart, 1.0))
-    near = np.isfinite(distance)
+    # Spots fainter than the cut that made the net are light all the same.
+    points, height = _peaks(_band(picture, net.scale), net.scale, SIGNIFICANT * noise * _gain(net.scale))
+    distance, nearest = cKDTree(points).query(places, distance_upper_bound=max(0.4 * apart, 1.0))
+    near = np.isfinite(distance) & inside
     nearest = np.where(near, nearest, 0)
-    brightness = np.where(near & inside, net.height[nearest], 0.0)
-    positions = np.where((near & inside)[..., None], net.points[nearest], np.nan)
-    # Spots fainter than the cut that made the net are still light: look at the band at their place.
-    band = ndimage.gaussian_filter(picture, net.scale) - ndimage.gaussian_filter(picture, OUTER * net.scale)
-    reach = 2 * max(1, int(0.25 * apart)) + 1
-    highest = ndimage.maximum_filter(band, reach)
-    at = np.clip(np.rint(places).astype(int), 0, np.array(picture.shape) - 1)
-    brightness = np.where(~near & inside, highest[at[..., 0], at[..., 1]], brightness)
+    brightness = np.where(near, height[nearest], 0.0)
+    positions = np.where(near[..., None], points[nearest], np.nan)
     typical = np.array([np.quantile(b[n], 0.75) if n.any() else np.inf for b, n in zip(brightness, near, strict=True)])
     mask: NDArray[np.bool_] = np.all(brightness >= illuminated * typical[:, None, None], axis=0)
+    # A lenslet with light that has none beside it is a cosmic ray or a ghost.
+    beside = ndimage.convolve(mask.astype(int), [[0, 1, 0], [1, 0, 1], [0, 1, 0]], mode="constant")
+    mask &= beside > 0
     if mask.sum() < MIN_SPOTS:
         raise NoGrid(f"only {int(mask.sum())} lenslets have light; a grid needs {MIN_SPOTS}")
     positions = np.where(mask[..., None], positions, np.nan)
 
-    fwhm, contrast, height = _shape(picture, places[:, mask].reshape(-1, 2), apart, float(np.hypot(*vectors.T).min()))
+    fwhm, contrast, above = _shape(picture, places[:, mask].reshape(-1, 2), apart, float(np.hypot(*vectors.T).min()))
     if fwhm > MAX_WIDTH * apart:
         raise NoGrid(
             f"there is a regular pattern of {vectors[0][0]:.1f} x {vectors[1][1]:.1f} px, but its bright places are "
             f"{fwhm:.1f} px wide: the light of the lenslets, not spots; no grid"
         )
-    noise = _noise(picture)
-    if contrast < MIN_CONTRAST or (contrast < CLEAR_CONTRAST and height < MIN_HEIGHT * noise):
+    if contrast < MIN_CONTRAST or (contrast < CLEAR_CONTRAST and above < MIN_HEIGHT * noise):
         raise NoGrid(
             f"there is a regular pattern of {vectors[0][0]:.1f} x {vectors[1][1]:.1f} px, but its bright places stand "
-            f"only {100 * contrast:.0f} % above the light between them, {height / max(noise, 1e-300):.1f} times the "
+            f"only {100 * contrast:.0f} % above the light between them, {above / max(noise, 1e-300):.1f} times the "
             "noise of a pixel: lenslets without spots; no grid"
         )
     rows, cols = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
