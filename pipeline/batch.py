@@ -219,7 +219,7 @@ def reduce(
     repeated = timing.repeated(slopes, flux)
     if repeated.sum() > 0.5 * frames:
         raise BatchError(f"{repeated.sum()} of {frames} frames repeat the one before: the camera was frozen")
-    light, out = _light(flux)
+    light, out = _light(flux, frame_rate)
     if repeated.any() or out.any():
         slopes, flux = slopes.copy(), flux.copy()
         lost = out | repeated[:, None]
@@ -229,11 +229,11 @@ def reduce(
     seen = np.isfinite(flux)
     valid = seen.mean(axis=(0, 2))
     for number, fraction in enumerate(valid):
-        if not seen[:, number].any(axis=0).all() or fraction < 0.5:
+        if fraction < 0.5:
             never = int((~seen[:, number].any(axis=0)).sum())
             raise BatchError(
                 f"source {number + 1} could be measured in {fraction:.1%} of its spots "
-                f"({never} of {flux.shape[2]} subapertures never); at least half of each is needed"
+                f"({never} of {flux.shape[2]} subapertures never); at least half is needed"
             )
     if parameters.flux_trend is not None:
         flux = flux / timing.slow_part(light, frame_rate, parameters.flux_trend)[:, :, None]
@@ -244,10 +244,11 @@ def reduce(
     else:
         covariance = convergence.independent(found.covariance, frames, geometry, found.valid_fraction)
         n_effective = np.full(3, float(frames))
-    detection = (measurements.flux_noise / found.mean_flux**2).mean(axis=1)
+    detection = _mean(measurements.flux_noise / found.mean_flux**2)
 
     tilt = timing.pupil_mean(slopes)
-    line = vibration.find_line(timing.regular(tilt.mean(axis=2), measurements.time, frame_rate), frame_rate)
+    common = timing.regular(timing.pupil_mean(tilt), measurements.time, frame_rate)
+    line = vibration.find_line(common, frame_rate)
     maps = found.maps
     if parameters.vibration == "subtracted":
         maps = maps.copy()
@@ -296,7 +297,7 @@ def reduce(
             "maps": maps,
             "noise_covariance": covariance,
             "n_effective": n_effective,
-            "mean_flux": found.mean_flux.mean(axis=1),
+            "mean_flux": _mean(found.mean_flux),
             "scintillation_index": index,
             "valid_fraction": valid,
             "n_frames": np.asarray(frames),
@@ -327,13 +328,13 @@ def reduce(
     )
 
 
-def _light(flux: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _light(flux: NDArray[np.float64], frame_rate: float) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Relative light of each source over the pupil, (T, S), and the frames in which it is out."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a spot that is never measured has no mean
         usual = np.nanmean(flux[:: checks.EVERY], axis=0)
     light = timing.pupil_mean(flux / np.where(usual > 0, usual, np.nan))
-    return light, timing.outages(light)
+    return light, timing.outages(light, frame_rate)
 
 
 def _mean(values: NDArray[np.float64]) -> NDArray[np.float64]:

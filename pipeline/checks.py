@@ -463,7 +463,8 @@ def stationarity(
         weight[block + centre] = 1.0
         if kind < 2:
             # The mean over the pupil has the mean of the map over all pairs as its variance.
-            weight[block : block + entries] -= geometry.pair_count.ravel() / geometry.n_subapertures**2
+            pairs = found.pair_count[AUTO_MAP[kind]].ravel()
+            weight[block : block + entries] -= pairs / max(pairs.sum(), 1)
         rows = np.bincount(geometry.mirror, weight, weight.size)[geometry.independent]
         kept = rows != 0
         variance = rows[kept] @ noise_covariance[np.ix_(kept, kept)] @ rows[kept]

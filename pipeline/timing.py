@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy import fft
+from scipy import fft, ndimage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,6 +17,8 @@ GAP = 1.5
 #: Part of its usual light, averaged over the pupil, below which a source is out. Twenty subapertures at a scintillation
 #: index of 1 get there once in ten thousand frames.
 OUT = 0.3
+#: Part of its usual light, averaged over the pupil and `WHILE` (s), below which a source is covered.
+COVERED, WHILE = 0.5, 1.0
 #: Frames to either side of those in which a source is out that are left out too: it may have changed during exposure.
 GUARD = 1
 
@@ -157,30 +159,42 @@ def pupil_mean(values: NDArray[np.floating]) -> Floats:
     return np.asarray(mean.reshape(values.shape[:-1]))
 
 
-def outages(light: Floats) -> NDArray[np.bool_]:
+def outages(light: Floats, frame_rate: float) -> NDArray[np.bool_]:
     """Frames in which a source is out: its light over the whole pupil is far below what it usually is.
+
+    Scintillation fades for less than a second, so what lasts longer is judged by its mean over a second, and more
+    strictly.
 
     Parameters
     ----------
     light : ndarray, (T, S)
         Mean relative flux over the pupil; NaN where no spot was found.
+    frame_rate : float
+        Hz.
 
     Returns
     -------
     ndarray of bool, (T, S)
-        With `GUARD` frames to either side.
+        With `GUARD` frames, or half of `WHILE`, to either side.
     """
-    seen = np.isfinite(light)
-    usual = np.array(
-        [np.median(column[here]) if here.any() else np.nan for column, here in zip(light.T, seen.T, strict=True)]
-    )
-    with np.errstate(invalid="ignore"):
-        out = ~(light >= OUT * usual)
-    wide = out.copy()
-    for step in range(1, GUARD + 1):
-        wide[step:] |= out[:-step]
-        wide[:-step] |= out[step:]
-    return wide
+    result = np.ones(light.shape, dtype=bool)
+    width = min(round(WHILE * frame_rate), len(light)) | 1
+    for source, column in enumerate(light.T):
+        seen = np.isfinite(column)
+        if not seen.any():
+            continue
+        relative = np.where(seen, column, 0.0) / np.median(column[seen])
+        out = _widened(relative < OUT, GUARD)
+        mean = ndimage.uniform_filter1d(relative, width, mode="nearest")
+        result[:, source] = out | _widened(mean < COVERED, width // 2)
+    return result
+
+
+def _widened(mark: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """A mark with `reach` frames to either side."""
+    if not mark.any():
+        return mark
+    return np.asarray(ndimage.maximum_filter1d(mark.astype(np.uint8), 2 * reach + 1, mode="constant") > 0)
 
 
 def trend(values: NDArray[np.floating]) -> Floats:

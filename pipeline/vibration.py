@@ -30,6 +30,8 @@ SURROUNDINGS = 3.0
 #: Half the width of the band that a line is summed over, Hz, and at most that part of its frequency. A machine whose
 #: phase wanders has wide wings: of the sample recording's line 91 % lies within 0.5 Hz, 95 % within 2 Hz.
 HALF_WIDTH, RELATIVE = 2.0, 0.05
+#: Gaps are filled with means over this time, s.
+BRIDGE = 0.2
 #: Lines are looked for from here on, Hz: below, the turbulent tilt has a slope that looks like one.
 LOWEST = 5.0
 #: Chance that a spectrum without a line passes as one with.
@@ -86,11 +88,9 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
         return nothing
     values = np.asarray(tilt, dtype=np.float64)
     if missing.any():
-        frames, seen = np.arange(len(values)), np.flatnonzero(~missing)
-        values = np.stack([np.interp(frames, seen, column[seen]) for column in values.T], axis=1)
-    present = 1.0 - float(missing[: length + 1].mean())
+        values = _bridged(values, missing, max(round(BRIDGE * frame_rate), 3))
     frequency = np.arange(length // 2 + 1) * frame_rate / length
-    power = np.abs(fft.rfft(np.diff(values, axis=0)[:length], axis=0)) ** 2 * (2 / (length**2 * present))
+    power = np.abs(fft.rfft(np.diff(values, axis=0)[:length], axis=0)) ** 2 * (2 / length**2)
     power[1:] /= 4 * np.sin(np.pi * frequency[1:, None] / frame_rate) ** 2
 
     cells = len(power) // per_cell
@@ -119,4 +119,24 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
     band = np.abs(frequency - centre) <= half
     beside = ~band & (np.abs(frequency - centre) <= 2 * half)
     level = power[beside].mean(axis=0)
-    return Vibration(centre, np.maximum(power[band].sum(axis=0) - band.sum() * level, 0.0), significance)
+    variance = np.maximum(power[band].sum(axis=0) - band.sum() * level, 0.0)
+    if missing.any():
+        # A line that is cut into pieces is convolved with the spectrum of the cuts: what of it stays in the band.
+        cuts = np.abs(fft.rfft((~missing[:length]).astype(np.float64)) / length) ** 2
+        inside = int(half * length / frame_rate)
+        variance /= cuts[0] + 2 * cuts[1 : inside + 1].sum()
+    return Vibration(centre, variance, significance)
+
+
+def _bridged(values: Floats, missing: NDArray[np.bool_], width: int) -> Floats:
+    """Fill gaps with running means of what is there, which know of slow tilt and nothing of a line."""
+    known = np.where(missing[:, None], 0.0, values)
+    share = ndimage.uniform_filter1d((~missing).astype(np.float64), width, mode="nearest")
+    near = share > 0.5 / width
+    frames, place = np.arange(len(values)), np.flatnonzero(near)
+    filled = values.copy()
+    for axis in range(values.shape[1]):
+        mean = ndimage.uniform_filter1d(known[:, axis], width, mode="nearest")
+        mean = np.interp(frames, place, mean[place] / share[place])
+        filled[missing, axis] = mean[missing]
+    return filled
