@@ -655,8 +655,8 @@ MUTATIONS = {
         "return mean, 2 * np.pi * fx * mean, 2 * np.pi * fy * mean",
         "return mean, fx * mean, fy * mean",
     ),
-    "k^2 lost": ("(2 * model.wavenumber) * seen", "2 * seen"),
-    "sign of the centroid term": ("(model.centroid_term * mean) * about", "-(model.centroid_term * mean) * about"),
+    "k^2 lost": ("2 * model.wavenumber * mean", "2 * mean"),
+    "sign of the centroid term": ("glint * about", "-glint * about"),
     "midpoint for mean": ("_slice_integral(model, z0, z1)", "(z1 - z0) * _at(model, (z0 + z1) / 2)"),
 }
 
