@@ -30,19 +30,8 @@ COMMANDS = {
 }
 
 
-class Interrupted(BaseException):
-    """SIGINT or SIGTERM."""
-
-
 class Commands(click.Group):
     """Commands that are imported only when they are called."""
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; an interrupt is told by :func:`main`, in one line."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise Interrupted from error
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """In the order of use."""
@@ -101,13 +90,17 @@ def main() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup and shells in the background want it
             signal.signal(number, _stop)
     try:
-        sys.exit(cli.main(standalone_mode=False) or 0)
+        if "_COSLIDAR_COMPLETE" in os.environ:
+            cli.main(prog_name="coslidar")  # completion in the shell
+        # Not cli.main: how a program ends is told below, and nowhere else.
+        with cli.make_context("coslidar", sys.argv[1:]) as context:
+            sys.exit(cli.invoke(context) or 0)
     except click.exceptions.Exit as leave:
         sys.exit(leave.exit_code)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)
-    except (Interrupted, KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, click.Abort):
         if sys.stderr.isatty():
             click.echo(err=True)  # the terminal has written ^C into this line
         complain(["interrupted; what was finished is kept, the same command goes on from there"])

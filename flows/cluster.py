@@ -38,7 +38,7 @@ log = logging.getLogger("coslidar")
 #: A batch that has been lost with its worker more often than this is taken for poison.
 ALLOWED_FAILURES = 3
 #: How long a cluster may take to answer, and to have its first worker, s.
-PATIENCE = 20
+PATIENCE = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +222,8 @@ def connect(run: RunParameters) -> Iterator[Client]:
     from distributed.versions import VersionMismatchWarning
 
     # Prefect gives every logger a handler; what went wrong in a batch is told once, by the driver.
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
     threads = run.threads or _cores()
     with dask.config.set(_settings()):

@@ -27,7 +27,7 @@ from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from .cluster import ALLOWED_FAILURES, BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
 from .plan import ArchivePlan, BatchWindow, plan_archive
-from .settings import InputError, cache_folder
+from .settings import InputError, Unavailable, cache_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -135,9 +135,11 @@ class Work:
         self.responses = Kept(cache_folder() / "responses")
 
     def check(self) -> None:
-        """Raise Stopped where the run is to stop."""
+        """Raise Stopped where the run is to stop, Unavailable where nothing is left to compute on."""
         if self.stopping.is_set():
             raise Stopped
+        if self.client.status in ("closing", "closed"):
+            raise lost(self.settings)
 
     def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
         """Response matrix, computed once for all archives of one geometry."""
@@ -160,6 +162,14 @@ class Work:
                     self.responses.save(digest, {"M": found})
             self._matrices[digest] = found
             return found
+
+
+def lost(settings: Settings) -> Unavailable:
+    """The error for a cluster that has gone in the middle of a run."""
+    where = settings.run.scheduler or "this machine"
+    return Unavailable(
+        f"the Dask scheduler at {where} was lost; what was finished is kept, the same command goes on from there"
+    )
 
 
 def kept_correlations(root: Path) -> Kept:
@@ -192,6 +202,8 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
         outcome = ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
     except Stopped:
         return ArchiveOutcome(url, name, "cancelled")
+    except Unavailable:
+        raise
     except Exception as error:
         # Whatever else goes wrong with one archive must not take the others down.
         log.debug("archive %s failed", url, exc_info=True)
@@ -357,7 +369,11 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
             except Empty:
                 continue
             _, window = flying.pop(future.key)
-            outcome = _outcome(future, window, plan)
+            try:
+                outcome = _outcome(future, window, plan)
+            except CancelledError as error:
+                work.check()
+                raise lost(settings) from error
             future.release()
             submit()
             yield window, outcome
@@ -378,7 +394,7 @@ def _outcome(future: Future, window: BatchWindow, plan: ArchivePlan) -> BatchOut
             f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
         )
     except CancelledError:
-        reason = "the Dask scheduler was lost"
+        raise
     except Exception as error:
         log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
         reason = f"{type(error).__name__}: {safe(str(error))}"
@@ -416,7 +432,9 @@ def in_threads(process: Callable[[str, Work], ArchiveOutcome], archives: list[st
             pending = set(futures)
             while pending:
                 # Short waits, so that an interrupt is noticed at once.
-                _, pending = wait(pending, timeout=PATIENCE, return_when=FIRST_COMPLETED)
+                done, pending = wait(pending, timeout=PATIENCE, return_when=FIRST_COMPLETED)
+                for future in done:
+                    future.result()
         except BaseException:
             work.stopping.set()
             raise

@@ -71,17 +71,19 @@ def plan(
 ) -> None:
     """Show what a run would read, compute and reuse; nothing is computed and nothing written."""
     from ...catalog.archive import ArchiveError
-    from ...catalog.store import Catalog
+    from ...catalog.store import DATABASE_FILE
     from ...pipeline.units import safe
     from ..cli import complain
     from ..driver import kept_correlations
     from ..plan import plan_archive
+    from ..progress import counted
     from ..settings import InputError
+    from .results import existing
 
     settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
     faults: list[str] = []
     frames = computed = 0
-    catalog = Catalog(settings.output, create=False) if (settings.output / "catalog.sqlite").exists() else None
+    catalog = existing(settings.output) if (settings.output / DATABASE_FILE).exists() else None
     kept = kept_correlations(settings.output.absolute())
     for url in settings.archives:
         try:
@@ -90,17 +92,18 @@ def plan(
             faults += error.faults
             continue
         if catalog is not None and catalog.has(planned.archive.identity, planned.profile_key):
-            click.echo(f"{planned.name}: {len(planned.windows)} batches, already in the catalog")
+            click.echo(f"{safe(planned.name)}: {counted(len(planned.windows), 'batch')}, in the catalog already")
             continue
         new = [window for window in planned.windows if not kept.has(planned.correlation_key(window))]
         read = sum(window.stop - window.start for window in new)
         frames += read
         computed += len(planned.windows)
         click.echo(
-            f"{safe(planned.name)}: {len(planned.windows)} batches to compute, {len(planned.windows) - len(new)} "
-            f"from kept correlations, {read} frames to read  (key {str(planned.profile_key)[:16]})"
+            f"{safe(planned.name)}: {counted(len(planned.windows), 'batch')} to compute, "
+            f"{len(planned.windows) - len(new)} from kept correlations, {counted(read, 'frame')} to read  "
+            f"(key {str(planned.profile_key)[:16]})"
         )
-    click.echo(f"in all {computed} batches to compute, {frames} frames to read")
+    click.echo(f"in all {counted(computed, 'batch')} to compute, {counted(frames, 'frame')} to read")
     if faults:
         complain(faults)
         raise click.exceptions.Exit(2)
@@ -126,7 +129,7 @@ def run(
     Give a campaign file, raw archives (folders, .zip files, URLs), or both. What the catalog already holds is not
     computed again; a run that was interrupted goes on where it was. One bad archive or batch does not stop the others.
     """
-    from ..progress import progress
+    from ..progress import counted, progress
     from ..run import run as process
 
     settings = settings_of(inputs, out, assignments, scheduler, sampling=sampling, slices=slices)
@@ -134,7 +137,8 @@ def run(
         outcomes = process(settings, watcher, prefect=not no_prefect)
     published = [outcome for outcome in outcomes if outcome.status in ("published", "present")]
     if not quiet and published:
-        click.echo(f"{len(published)} of {len(outcomes)} archives are in {settings.output}")
+        verb = "is" if len(published) == 1 else "are"
+        click.echo(f"{len(published)} of {counted(len(outcomes), 'archive')} {verb} in {settings.output}")
         source = inputs[0] if inputs[0].endswith(".toml") else published[0].product
         click.echo(f"Next: coslidar report {source} -o report.html")
     if any(outcome.input_fault for outcome in outcomes):

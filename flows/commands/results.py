@@ -19,13 +19,18 @@ _OUT = click.option(
 )
 
 
-def _open(folder: Path) -> Catalog:
-    from ...catalog.store import Catalog, CatalogError
+def existing(folder: Path) -> Catalog:
+    """The catalog in a folder; never makes one."""
+    from ...catalog.database import DatabaseError
+    from ...catalog.store import DATABASE_FILE, Catalog, CatalogError
+    from ...pipeline.units import safe
     from ..settings import InputError
 
+    if not (folder / DATABASE_FILE).exists():
+        raise InputError([f"{safe(str(folder))}: there is no catalog; 'coslidar run' makes one, --out names another"])
     try:
         return Catalog(folder, create=False)
-    except CatalogError as error:
+    except (CatalogError, DatabaseError) as error:
         raise InputError([str(error)]) from error
 
 
@@ -56,13 +61,15 @@ def catalog() -> None:
 @click.option("--batches", is_flag=True, help="One line per batch instead of one per product.")
 def catalog_ls(out: Path, campaign: str | None, batches: bool) -> None:
     """List products, or their batches."""
-    with _open(out) as opened:
+    from ..progress import counted
+
+    with existing(out) as opened:
         if not batches:
             rows = opened.products(campaign_name=campaign)
             click.echo(f"{'product':<44} {'start (UTC)':<20} {'batches':>7}  file")
             for row in rows:
                 click.echo(f"{row.name:<44} {_time(row.start):<20} {row.batches:>7}  {row.path}")
-            click.echo(f"{len(rows)} products in {out}")
+            click.echo(f"{counted(len(rows), 'product')} in {out}")
             return
         found = opened.batches(campaign_name=campaign)
         click.echo(
@@ -86,6 +93,21 @@ def catalog_ls(out: Path, campaign: str | None, batches: bool) -> None:
             )
 
 
+@catalog.command("runs")
+@_OUT
+@click.option("--failures", is_flag=True, help="Also every archive and batch that failed in each, and why.")
+def catalog_runs(out: Path, failures: bool) -> None:
+    """List runs: when each began, how it ended, what failed in it."""
+    with existing(out) as opened:
+        click.echo(f"{'start (UTC)':<20} {'state':<12} {'failures':>8}  command")
+        for made in opened.runs():
+            failed = opened.failures(made.id)
+            click.echo(f"{_time(made.started):<20} {made.state:<12} {len(failed):>8}  {made.command}")
+            for failure in failed if failures else ():
+                what = failure.archive if failure.start is None else f"{failure.archive} at {_time(failure.start)}"
+                click.echo(f"    {what}: {failure.reason.removeprefix(failure.archive + ': ')}")
+
+
 @catalog.command("show")
 @click.argument("product")
 @_OUT
@@ -94,7 +116,7 @@ def catalog_show(product: str, out: Path, as_json: bool) -> None:
     """Show a product (its name, the beginning of its key, or its file): profiles, settings, lineage."""
     import json
 
-    with _open(out) as opened:
+    with existing(out) as opened:
         row = _find(opened, product)
         dataset = opened.open(row)
         if as_json:
@@ -135,7 +157,7 @@ def catalog_export(product: str, out: Path, form: str, output: Path) -> None:
     from ...catalog import export
     from ..settings import InputError
 
-    with _open(out) as opened:
+    with existing(out) as opened:
         dataset = opened.open(_find(opened, product))
     output.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -154,7 +176,7 @@ def catalog_export(product: str, out: Path, form: str, output: Path) -> None:
 @click.option("--fast", is_flag=True, help="Compare sizes, not hashes.")
 def catalog_verify(out: Path, fast: bool) -> None:
     """Check that every product is what its row says."""
-    with _open(out) as opened:
+    with existing(out) as opened:
         faults = opened.verify(fast=fast)
         total = len(opened.products())
     for fault in faults:
@@ -168,7 +190,7 @@ def catalog_verify(out: Path, fast: bool) -> None:
 @_OUT
 def catalog_gc(out: Path) -> None:
     """Remove files that no row knows, as a killed run leaves them."""
-    with _open(out) as opened:
+    with existing(out) as opened:
         removed = opened.collect()
     click.echo(f"{len(removed)} files removed")
 
@@ -195,12 +217,12 @@ def report(inputs: tuple[str, ...], output: Path, out: Path) -> None:
             chosen, title = _of_campaign(path)
             datasets += chosen
         elif path.is_dir():
-            with _open(path) as opened:
+            with existing(path) as opened:
                 datasets += [opened.open(row) for row in _newest(opened.products())]
         elif path.is_file():
             datasets.append(open_product(path))
         else:
-            with _open(out) as opened:
+            with existing(out) as opened:
                 datasets.append(opened.open(_find(opened, item)))
     if not datasets:
         raise InputError([f"{', '.join(inputs)}: there is no product yet; 'coslidar run' makes them"])
@@ -225,7 +247,7 @@ def _of_campaign(path: Path) -> tuple[list[Any], str | None]:
 
     settings = load(path)
     found = []
-    with _open(settings.output) as opened:
+    with existing(settings.output) as opened:
         rows = opened.products(campaign_name=settings.campaign)
         for url in settings.archives:
             try:

@@ -103,3 +103,28 @@ def started(cache: Path, tmp_path: Path) -> Iterator[Callable[..., subprocess.Po
         if process.poll() is None:
             process.send_signal(signal.SIGKILL)
         process.communicate()
+
+
+@pytest.fixture
+def main_here(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., Finished]:
+    """Run the program in this process: quicker, and what it needs can be patched."""
+    from coslidar.flows.cli import main
+
+    def call(*arguments: object) -> Finished:
+        monkeypatch.setattr("sys.argv", ["coslidar", *map(str, arguments)])
+        monkeypatch.chdir(tmp_path)
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        begin = time.monotonic()
+        capsys.readouterr()
+        try:
+            with pytest.raises(SystemExit) as leave:
+                main()
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+        said = capsys.readouterr()
+        return Finished(int(leave.value.code or 0), said.out, said.err, time.monotonic() - begin)
+
+    return call
