@@ -423,23 +423,22 @@ class _Net:
 def _net(points: Floats, height: Floats, scale: float) -> _Net | None:
     """The grid that joins most points; None where no steps repeat."""
     tree = cKDTree(points)
-    best: tuple[int, float, Floats, NDArray[np.int64], NDArray[np.int64]] | None = None
+    best: tuple[float, Floats] | None = None
     for vectors in _lattices(points, tree):
-        labels, sizes = _joined(points, tree, vectors)
-        area = abs(float(np.linalg.det(vectors)))
-        # The same spots joined by shorter steps would be the same spots in smaller boxes: there, two are one box.
-        if best is None or (sizes.max(), area) > best[:2]:
-            best = (int(sizes.max()), area, vectors, labels, sizes)
-    if best is None or best[0] < MIN_SPOTS:
+        sizes, error = _joined(points, tree, vectors)[1:]
+        # Steps that fit only within the tolerance join spots of different sources.
+        worth = float(sizes.max()) * (1 - error / 2)
+        if best is None or worth > best[0]:
+            best = (worth, vectors)
+    if best is None:
         return None
-    size, _, vectors, labels, sizes = best
-    main = int(np.argmax(sizes))
-    member = np.flatnonzero(labels == main)
-    index = _numbered(points, member, vectors)
-    start, vectors, kept = _line(points[member], index, vectors)
-    member, index = member[kept], index[kept]
-    if len(member) < MIN_SPOTS or np.ptp(index, axis=0).min() < 1:
+    net = _walked(points, tree, best[1])
+    if net is not None and (doubled := _doubled(points, net)) is not None:
+        net = _walked(points, tree, doubled) or net
+    if net is None:
         return None
+    labels, sizes, member, index, start, vectors = net
+    size = int(sizes.max())
     # Other nets with the same steps are other sources; what is much smaller is stray light or a piece of this one.
     phase = (points - start) @ np.linalg.inv(vectors)
     phase -= np.rint(phase)
@@ -462,6 +461,46 @@ def _net(points: Floats, height: Floats, scale: float) -> _Net | None:
     # The rings and crosses of diffraction make nets of their own between the spots, finer and much fainter.
     explained = int(np.sum(taken & (height > FAINT * np.quantile(height[taken], 0.9))))
     return _Net(scale, points, height, member, index, vectors, start, np.array(offsets).reshape(-1, 2), explained)
+
+
+if TYPE_CHECKING:
+    _Walk = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Floats, Floats]
+
+
+def _walked(points: Floats, tree: Any, vectors: Floats) -> _Walk | None:
+    """The largest net of given steps: labels and sizes of all nets, its members, their (i, j), origin and steps."""
+    labels, sizes, _ = _joined(points, tree, vectors)
+    member = np.flatnonzero(labels == int(np.argmax(sizes)))
+    if len(member) < MIN_SPOTS:
+        return None
+    index = _numbered(points, member, vectors)
+    start, vectors, kept = _line(points[member], index, vectors)
+    member, index = member[kept], index[kept]
+    if len(member) < MIN_SPOTS or np.ptp(index, axis=0).min() < 1:
+        return None
+    return labels, sizes, member, index, start, vectors
+
+
+def _doubled(points: Floats, net: _Walk) -> Floats | None:
+    """Steps of a grid of two sources that lie nearly, but not quite, half a pitch apart: taken for one finer grid.
+
+    Every other spot is then off the fine grid by the same amount. None where there is no such amount.
+    """
+    _, _, member, index, start, (a, b) = net
+    rest = points[member] - start - index @ np.stack([a, b])
+    for parity, doubled in (
+        (index[:, 0], np.stack([2 * a, b])),
+        (index[:, 1], np.stack([a, 2 * b])),
+        (index.sum(axis=1), np.stack([a + b, a - b])),
+    ):
+        odd = parity % 2 == 1
+        if min(odd.sum(), (~odd).sum()) < MIN_SPOTS:
+            continue
+        apart = rest[odd].mean(axis=0) - rest[~odd].mean(axis=0)
+        spread = (rest[odd].var(axis=0).sum() / odd.sum() + rest[~odd].var(axis=0).sum() / (~odd).sum()) ** 0.5
+        if np.hypot(*apart) > max(0.2, 5 * spread):
+            return _reduced(doubled)
+    return None
 
 
 def _lattices(points: Floats, tree: Any) -> list[Floats]:
@@ -512,30 +551,35 @@ def _reduced(vectors: Floats) -> Floats | None:
     return np.stack([a, b])
 
 
-def _edges(points: Floats, tree: Any, vectors: Floats) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """For each axis, pairs of points that are one step apart."""
+def _edges(
+    points: Floats, tree: Any, vectors: Floats
+) -> tuple[list[tuple[NDArray[np.int64], NDArray[np.int64]]], float]:
+    """For each axis, pairs of points that are one step apart; and how well they are, over what is allowed."""
     reach = max(NEAR * min(np.hypot(*vectors.T)), 0.7)
-    pairs = []
+    pairs, squares = [], []
     for vector in vectors:
         distance, other = tree.query(points + vector, distance_upper_bound=reach)
         start = np.flatnonzero(np.isfinite(distance))
         pairs.append((start, other[start]))
-    return pairs
+        squares.append(distance[start] ** 2)
+    every = np.concatenate(squares)
+    return pairs, float(np.sqrt(every.mean())) / reach if len(every) else 1.0
 
 
-def _joined(points: Floats, tree: Any, vectors: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of its net for each point, and sizes of the nets."""
-    start, end = (np.concatenate(ends) for ends in zip(*_edges(points, tree, vectors), strict=True))
+def _joined(points: Floats, tree: Any, vectors: Floats) -> tuple[NDArray[np.int64], NDArray[np.int64], float]:
+    """Number of its net for each point, sizes of the nets, and the error of the steps as in :func:`_edges`."""
+    pairs, error = _edges(points, tree, vectors)
+    start, end = (np.concatenate(ends) for ends in zip(*pairs, strict=True))
     graph = coo_matrix((np.ones(len(start)), (start, end)), shape=(len(points),) * 2)
     _, labels = connected_components(graph, directed=False)
-    return labels, np.bincount(labels)
+    return labels, np.bincount(labels), error
 
 
 def _numbered(points: Floats, member: NDArray[np.int64], vectors: Floats) -> NDArray[np.int64]:
     """Grid index (i, j) of each point of a net, found by walking along it: no error of the steps adds up."""
     own = points[member]
     neighbours: list[list[tuple[int, int, int]]] = [[] for _ in member]
-    for axis, (start, end) in enumerate(_edges(own, cKDTree(own), vectors)):
+    for axis, (start, end) in enumerate(_edges(own, cKDTree(own), vectors)[0]):
         for a, b in zip(start.tolist(), end.tolist(), strict=True):
             neighbours[a].append((b, axis, 1))
             neighbours[b].append((a, axis, -1))
@@ -609,6 +653,11 @@ def _measured(picture: Floats, net: _Net, noise: float, illuminated: float) -> L
     mask &= beside > 0
     if mask.sum() < MIN_SPOTS:
         raise NoGrid(f"only {int(mask.sum())} lenslets have light; a grid needs {MIN_SPOTS}")
+    if len(offsets) * mask.sum() < net.explained / 2:
+        raise NoGrid(
+            f"{net.explained} spots repeat, but no more than {int(mask.sum())} lenslets have all of their "
+            f"{len(offsets)}; no grid"
+        )
     positions = np.where(mask[..., None], positions, np.nan)
 
     fwhm, contrast, above = _shape(picture, places[:, mask].reshape(-1, 2), apart, float(np.hypot(*vectors.T).min()))
