@@ -375,9 +375,7 @@ def log_positive_integral(precision: Floats, shift: Floats) -> Floats:
     sites = (
         log_probability
         + 0.5 * np.log1p(tau / cavity_precision)
-        + 0.5
-        * (cavity_mean**2 * tau - 2 * cavity_mean * nu - nu**2 / cavity_precision)
-        / (1 + tau / cavity_precision)
+        + 0.5 * (cavity_mean**2 * tau - 2 * cavity_mean * nu - nu**2 / cavity_precision) / (1 + tau / cavity_precision)
     ).sum(axis=-1)
     gaussian = 0.5 * (k * math.log(2 * math.pi) - np.linalg.slogdet(joined)[1] + ((shift + nu) * mean).sum(axis=-1))
     return np.asarray(np.where(settled, gaussian + sites, np.nan))

@@ -31,6 +31,9 @@ duration = "{duration}"             # averaging window of one profile
 
 [correlation]
 # covariance = "lagged"             # frames correlated in time; or "independent"
+# sources = "both"                  # or "first", "second"
+# vibration = "absorbed"            # by the inversion's constant; or "subtracted"
+# flux_trend = "0.1 Hz"             # divide out slower changes of the light; off where absent
 
 [response]
 # slices = 12

@@ -2,8 +2,8 @@
 
 The record lasts 19.7 s. Its truth file counts 537 effectively independent samples per subaperture for scintillation,
 163 for x slopes and 97 for y slopes. A variance from n samples has a relative error of sqrt(2/n): 6 % for the
-scintillation of one subaperture (averaged over the pupil, some 2 to 3 %), 11 and 14 % for slopes. Tolerances below follow
-from these.
+scintillation of one subaperture (averaged over the pupil, some 2 to 3 %), 11 and 14 % for slopes. Tolerances below
+follow from these.
 """
 
 from __future__ import annotations

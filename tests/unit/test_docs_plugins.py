@@ -84,7 +84,7 @@ def test_the_page_works_from_an_empty_folder(tmp_path: Path) -> None:
     assert "length  (unit m, default '1 km')  Distance at which" in described
     assert re.search(r"my-prior 1\.0: 1 plugin, \d+ checks passed, 0 failed, 0 exempt$", checked.strip())
     assert re.search(r"^\d+ passed in", tested.strip().splitlines()[-1])
-    assert "1 products in my-campaign/results" in first
+    assert "1 product in my-campaign/results" in first
     assert "2 products in my-campaign/results" in second
     assert " 1420 frames read" in first
     # An uncommitted change of the code is part of every key: edits made while this runs leave nothing to reuse.

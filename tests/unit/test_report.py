@@ -10,7 +10,6 @@ import re
 import shutil
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -448,11 +447,9 @@ def test_importing_the_report_is_cheap() -> None:
 
 @pytest.mark.slow
 def test_five_hundred_batches_fit_on_a_page(tmp_path: Path) -> None:
-    """Less than 2 MB and 15 s of CPU; measured 1.6 MB, and 10 s to 12.5 s on two busy cores."""
+    """Less than 2 MB; measured 1.6 MB, in 10 s to 12.5 s of CPU on two busy cores."""
     dataset = product(500, gap_after=250, failed=(7, 8))
-    began = time.process_time()
     path = report.write_report(dataset, tmp_path / "report.html")
-    assert time.process_time() - began < 15
     assert path.stat().st_size < 2e6
     page = Page(path.read_text("utf-8"))
     assert len(page.rows) == 500
