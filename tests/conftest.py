@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 # Before numpy: the suite runs several processes on few cores.
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -17,6 +18,18 @@ import coslidar.pipeline
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED = ROOT.parent / "shared"
+
+_approx = pytest.approx
+
+
+def approx(expected: Any, rel: float | None = None, abs: float | None = None, nan_ok: bool = False) -> Any:
+    """pytest's own without its absolute tolerance of 1e-12, which makes any Cn2 equal to any other."""
+    if abs is None:
+        return _approx(expected, rel=1e-6 if rel is None else rel, abs=0.0, nan_ok=nan_ok)
+    return _approx(expected, rel=rel, abs=abs, nan_ok=nan_ok)
+
+
+pytest.approx = approx  # type: ignore[assignment]
 
 settings.register_profile(
     "coslidar", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow], print_blob=True

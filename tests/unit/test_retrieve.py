@@ -185,6 +185,7 @@ def test_measured_flux_noise_is_taken_off_the_zero_separation(matrix: np.ndarray
     noise = 0.02 * noisy[ZERO[2]]
     noisy[ZERO[2]] += noise
     cleaned = retrieve(matrix, noisy, flux_variance=noise).values
-    assert cleaned["cn2"] == pytest.approx(np.full(6, CN2), rel=1e-3)
+    # Scaled to order 1: approx takes everything below 1e-12 for equal. The prior alone costs 1e-3.
+    assert cleaned["cn2"] / CN2 == pytest.approx(np.ones(6), rel=5e-3)
     assert np.isnan(cleaned["noise_variance_intensity"])
-    assert retrieve(matrix, noisy).values["cn2"] != pytest.approx(np.full(6, CN2), rel=1e-3)
+    assert np.abs(retrieve(matrix, noisy).values["cn2"] / CN2 - 1).max() > 0.02
