@@ -63,8 +63,11 @@ _NODES_PER_RADIAN = 0.36
 _SHELL_RATIO = math.sqrt(2.0)
 _MAX_SHELLS = 90
 _MAX_PANELS = 200
-#: Turns of the diffraction fringe within a slice above which its mean is negligible (below 1e-5 of a cross map).
+#: Turns of the diffraction fringe within a slice above which its mean is left out (below 1e-4 of the scintillation
+#: cross map of a point source; a source of a few cm blurs the fringe away).
 _FRINGE_TURNS = 20
+#: Phase in radians over which a fringe is long work to follow.
+_LONG = 3000.0
 _CHUNK = 2048
 
 #: Nested rules of 3, 7 and 15 points: Gauss-Legendre with the extensions of Kronrod and Patterson 1968
@@ -278,7 +281,7 @@ def _radial_power(spectrum: TurbulenceSpectrum) -> float:
 
 def _slice_integral(model: _Model, z0: float, z1: float) -> Array:
     """Integral of W over one slice, (6, 2p - 1, 2q - 1), halving panels until their rules agree."""
-    effort = _effort(model, z0, z1)
+    effort, _ = _effort(model, z0, z1)
     edges = _panel_edges(model, z0, z1, effort)
     # Wide panels first: what is added later needs no accuracy of its own.
     waiting = sorted(itertools.pairwise(edges), key=lambda panel: panel[1] - panel[0])
@@ -391,10 +394,15 @@ def _at(model: _Model, z: float) -> Array:
         # Tilts of a layer at the source move nothing, and it has no way to diffract.
         maps = np.zeros(shape)
     else:
-        maps = _maps(model, np.array([z]), np.ones((1, 1)), np.zeros(6), _effort(model, z, z))[0]
+        effort, checked = _effort(model, z, z)
+        maps = _one_layer(model, z, effort) if checked is None else checked
     if model.geometry.n_sources == 1:
         maps[list(_CROSS)] = np.nan
     return maps
+
+
+def _one_layer(model: _Model, z: float, effort: _Effort) -> Array:
+    return np.asarray(_maps(model, np.array([z]), np.ones((1, 1)), np.zeros(6), effort)[0])
 
 
 @dataclass(frozen=True)
@@ -425,11 +433,12 @@ def _turns_of_fringe(model: _Model, z: float) -> float:
     return reach**2 / (4 * geometry.wavelength * z * geometry.scaling(z)) if z else 0.0
 
 
-def _effort(model: _Model, z0: float, z1: float) -> _Effort:
-    """Orders with which the maps of a slice no longer move when they grow by a third.
+def _effort(model: _Model, z0: float, z1: float) -> tuple[_Effort, Array | None]:
+    """Orders with which the maps of a slice no longer move when they grow by a third, and the maps at its middle.
 
     Sources smaller than the fringe leave about 1e-3 of it in the scintillation cross map, beyond frequencies at which
-    nothing else is left. It is followed there, unless it turns so often within the slice that its mean is gone.
+    nothing else is left. It is followed there, unless it turns so often within the slice that its mean is gone. Where
+    that is long work the orders are checked without it, and there are no maps to hand on.
     """
     effort = _Effort()
     frequency = _fringe_frequency(model)
@@ -442,16 +451,17 @@ def _effort(model: _Model, z0: float, z1: float) -> _Effort:
         if left > 3e-4:
             often = _turns_of_fringe(model, z1) - _turns_of_fringe(model, z0) > _FRINGE_TURNS
             effort = _Effort(lowest=0.0 if often else 1.4 * frequency, without_fringe=often)
-    z = np.array([(z0 + z1) / 2])
-    rule, floor = np.ones((1, 1)), np.zeros(6)
-    maps = _maps(model, z, rule, floor, effort)[0]
+    z = (z0 + z1) / 2
+    long = 2 * math.pi * _reach(model, np.array([z]), True) * effort.lowest > _LONG
+    tried = replace(effort, lowest=0.0) if long else effort
+    maps = _one_layer(model, z, tried)
     for _ in range(6):
-        finer_effort = replace(effort, resolution=4 / 3 * effort.resolution)
-        finer = _maps(model, z, rule, floor, finer_effort)[0]
+        finer_effort = replace(tried, resolution=4 / 3 * tried.resolution)
+        finer = _one_layer(model, z, finer_effort)
         if np.all(np.abs(finer - maps).max(axis=(1, 2)) <= TOLERANCE * _sizes(finer)):
-            return effort
-        effort, maps = finer_effort, finer
-    raise ArithmeticError(f"the response at {z[0]:g} m does not converge: the source or the spectrum is too structured")
+            return replace(effort, resolution=tried.resolution), None if long else finer
+        tried, maps = finer_effort, finer
+    raise ArithmeticError(f"the response at {z:g} m does not converge: the source or the spectrum is too structured")
 
 
 def _maps(model: _Model, z: Array, rules: Array, floor: Array, effort: _Effort) -> Array:
