@@ -7,6 +7,7 @@ of one frame, or one file larger than the memory.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import warnings
@@ -282,10 +283,11 @@ class FitsFile(FrameFile):
         with self._open() as units:
             unit = self._unit(units)
             place = unit.fileinfo()
-            if self.path.suffix != ".gz" and place["datLoc"] + unit.size > self.path.stat().st_size:
+            # An image packed by tiles lies in a table, whose size is another.
+            needed = place["datLoc"] + (place["datSpan"] if hasattr(unit, "compression_type") else unit.size)
+            if self.path.suffix != ".gz" and needed > self.path.stat().st_size:
                 raise FileFault(
-                    f"the file ends after {self.path.stat().st_size} bytes, but its image needs "
-                    f"{place['datLoc'] + unit.size}; copy it again"
+                    f"the file ends after {self.path.stat().st_size} bytes, but its image needs {needed}; copy it again"
                 )
             if self.path.suffix == ".gz" and unit.size > MAX_WHOLE_BYTES:
                 raise FileFault("a packed FITS file of this size cannot be read in parts; unpack it with gunzip")
@@ -493,6 +495,33 @@ class NumpyFile(FrameFile):
 # --- TIFF --------------------------------------------------------------------------------------------------
 
 
+_BROKEN_TIFF = re.compile(
+    "invalid (page )?offset|invalid circular|corrupted|missing (data|ByteCounts)|does not match page"
+)
+
+
+class _Complaints(logging.Handler):
+    """What tifffile writes to its log, instead of raising."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.lines: list[str] = []
+        self._log = logging.getLogger("tifffile")
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a line."""
+        self.lines.append(record.getMessage())
+
+    def __enter__(self) -> _Complaints:
+        self._log.addHandler(self)
+        self._before, self._log.propagate = self._log.propagate, False
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        self._log.removeHandler(self)
+        self._log.propagate = self._before
+
+
 class TiffFile(FrameFile):
     """A TIFF of one page or a stack of pages."""
 
@@ -500,12 +529,12 @@ class TiffFile(FrameFile):
 
     @contextmanager
     def _open(self) -> Iterator[Any]:
-        import logging
-
         tifffile = library("tifffile", "reading TIFF")
-        logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-        with _quiet(), tifffile.TiffFile(self.path) as file:
+        with _quiet(), _Complaints() as said, tifffile.TiffFile(self.path) as file:
             yield file
+            # Pages that are cut off would otherwise be missing without a word.
+            if broken := next((line for line in said.lines if _BROKEN_TIFF.search(line)), None):
+                raise FileFault(f"its pages are damaged or cut off ({broken}); copy it again")
 
     @staticmethod
     def _series(file: Any) -> tuple[tuple[int, ...], np.dtype[Any], int | None]:

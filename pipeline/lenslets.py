@@ -417,22 +417,28 @@ class _Net:
 
     @property
     def score(self) -> float:
-        return self.explained * self.regular**2
+        # Of two ways to see the same spots the one with fewer in a box is the plainer.
+        return self.explained * self.regular**2 * 0.8 ** len(self.offsets)
 
 
 def _net(points: Floats, height: Floats, scale: float) -> _Net | None:
     """The grid that joins most points; None where no steps repeat."""
     tree = cKDTree(points)
-    best: tuple[float, Floats] | None = None
+    tried: list[tuple[float, float, Floats]] = []
     for vectors in _lattices(points, tree):
-        sizes, error = _joined(points, tree, vectors)[1:]
-        # Steps that fit only within the tolerance join spots of different sources.
-        worth = float(sizes.max()) * (1 - error / 2)
-        if best is None or worth > best[0]:
-            best = (worth, vectors)
-    if best is None:
+        _, sizes, error = _joined(points, tree, vectors)
+        first, second = np.sort(np.append(sizes, 0))[:-3:-1].tolist()
+        # One source makes one net, two make two of about a size; steps twice too long make two of one source's.
+        # And steps that fit only within the tolerance join spots of different sources.
+        worth = (first + second) * (1.0 if first > 0.7 * (first + second) else 0.8) * (1 - error / 2)
+        tried.append((worth, abs(float(np.linalg.det(vectors))), vectors))
+    if not tried:
         return None
-    net = _walked(points, tree, best[1])
+    # Two rows of lenslets with two spots each could be two rows of spots with two lenslets each: spots of a lenslet
+    # lie closer together than lenslets.
+    highest = max(worth for worth, _, _ in tried)
+    best = max((one for one in tried if one[0] > 0.97 * highest), key=lambda one: one[1])[2]
+    net = _walked(points, tree, best)
     if net is not None and (doubled := _doubled(points, net)) is not None:
         net = _walked(points, tree, doubled) or net
     if net is None:
