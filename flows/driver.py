@@ -205,6 +205,8 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
     except Unavailable:
         raise
     except Exception as error:
+        if work.client.status != "running":
+            raise lost(work.settings) from error
         # Whatever else goes wrong with one archive must not take the others down.
         log.debug("archive %s failed", url, exc_info=True)
         reason = f"{name}: {type(error).__name__}: {safe(str(error))}"
@@ -369,11 +371,7 @@ def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator
             except Empty:
                 continue
             _, window = flying.pop(future.key)
-            try:
-                outcome = _outcome(future, window, plan)
-            except CancelledError as error:
-                work.check()
-                raise lost(settings) from error
+            outcome = _outcome(future, window, plan)
             future.release()
             submit()
             yield window, outcome
@@ -394,7 +392,7 @@ def _outcome(future: Future, window: BatchWindow, plan: ArchivePlan) -> BatchOut
             f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
         )
     except CancelledError:
-        raise
+        raise  # somebody stopped the scheduler, or told it to forget
     except Exception as error:
         log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
         reason = f"{type(error).__name__}: {safe(str(error))}"
