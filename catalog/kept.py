@@ -1,13 +1,14 @@
 """Intermediate results that later runs can use: correlations of batches, response matrices.
 
-One file of plain arrays under the key of the result, written whole or not at all. A damaged file is no file.
+One file of plain arrays under the key of the result, written whole or not at all. A damaged file is no file: the
+checksums inside a zip do not cover all of it, so a hash of the whole stands at its end.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..pipeline.lineage import Key
+
+_DIGEST = hashlib.sha256().digest_size
 
 
 class Kept:
@@ -57,6 +60,7 @@ class Kept:
         target = self.path(key)
         packed = io.BytesIO()
         np.savez(packed, allow_pickle=False, **arrays)
+        packed.write(hashlib.sha256(packed.getbuffer()).digest())
         target.parent.mkdir(parents=True, exist_ok=True)
         temporary = target.parent / temporary_name()
         try:
@@ -68,7 +72,11 @@ class Kept:
     def load(self, key: Key | str) -> dict[str, NDArray[Any]] | None:
         """Arrays that were kept earlier; None where they are not there or damaged."""
         try:
-            with np.load(self.path(key), allow_pickle=False) as packed:
-                return {name: packed[name] for name in packed.files}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            content = self.path(key).read_bytes()
+        except OSError:
             return None
+        packed, digest = content[:-_DIGEST], content[-_DIGEST:]
+        if hashlib.sha256(packed).digest() != digest:
+            return None
+        with np.load(io.BytesIO(packed), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
