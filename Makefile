@@ -49,11 +49,11 @@ demo: $(VENV)/.core
 	@echo "       $(BIN)/coslidar init my-campaign                  a campaign file for your own recordings"
 
 test: $(VENV)/.test
-	@$(BIN)/python -m pytest -q -m "not slow" $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -q -m "not slow" -n auto --dist loadfile $(PYTEST_ARGS)
 	@echo "All tests passed.  Next: make demo, or make test-all for the slow science checks."
 
 test-all: $(VENV)/.test
-	@$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+	@$(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
 
 bench: $(VENV)/.test
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done

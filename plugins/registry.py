@@ -97,10 +97,7 @@ def _load(entry: Entry) -> type[Plugin]:
         found = entry.point.load()
     except Exception as error:  # a third party's import may fail in any way, and must not hide the others
         raise PluginError(
-            [
-                f"{entry.kind} '{entry.name}' ({entry.distribution}) failed to load: "
-                f"{type(error).__name__}: {error}"
-            ]
+            [f"{entry.kind} '{entry.name}' ({entry.distribution}) failed to load: {type(error).__name__}: {error}"]
         ) from error
     base = KINDS[entry.kind][1]
     if not (isinstance(found, type) and issubclass(found, base)):
@@ -148,9 +145,7 @@ def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> dict[str, 
     group = KINDS[kind][0]
     found: dict[str, Entry] = {}
     faults = []
-    for point in sorted(
-        entry_points(group=group) if points is None else points, key=lambda p: (p.name, p.value)
-    ):
+    for point in sorted(entry_points(group=group) if points is None else points, key=lambda p: (p.name, p.value)):
         entry = Entry(kind, point.name, _distribution(point), point)
         known = found.setdefault(point.name, entry)
         if known.point.value != point.value:

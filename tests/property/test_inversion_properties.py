@@ -30,9 +30,10 @@ def test_positive_solution_is_optimal(problem, log_mu):
     x = inversion.solve_positive(problem, mu)
     slope = problem.matrix.T @ (problem.matrix @ x - problem.data) + mu * problem.precision @ x
     # Rounding in each term of the gradient, of which the two parts cancel.
-    size = np.linalg.norm(problem.matrix, axis=0) * (
-        np.linalg.norm(problem.data) + np.linalg.norm(problem.matrix @ x)
-    ) + mu * np.abs(problem.precision) @ x
+    size = (
+        np.linalg.norm(problem.matrix, axis=0) * (np.linalg.norm(problem.data) + np.linalg.norm(problem.matrix @ x))
+        + mu * np.abs(problem.precision) @ x
+    )
     assert (x >= 0).all()
     assert (np.abs(slope[x > 0]) <= 1e-11 * size[x > 0]).all()
     assert (slope[x == 0] >= -1e-11 * size[x == 0]).all()

@@ -76,9 +76,7 @@ def test_rows_found_from_the_matrices_are_the_same(strong, matrix):
     full = convergence.expand(strong.covariance, GEOMETRY)
     data = np.where(GEOMETRY.valid, strong.data[0][GEOMETRY.mirror], np.nan)
     response_rows = np.where(GEOMETRY.valid[:, None], matrix[GEOMETRY.mirror], np.nan)
-    np.testing.assert_array_equal(
-        inversion.independent_rows(data, full, response_rows), GEOMETRY.independent
-    )
+    np.testing.assert_array_equal(inversion.independent_rows(data, full, response_rows), GEOMETRY.independent)
 
 
 def test_noise_free_data_return_the_profile(strong, matrix):

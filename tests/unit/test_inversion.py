@@ -460,8 +460,14 @@ def test_grid_keeps_its_step():
 
 @pytest.mark.parametrize(
     ("curve", "log_mu", "edge"),
-    [([3, 2, 1, 2], 25, False), ([1, 2, 3, 4], 23, True), ([4, 3, 2, 1], 26, True), ([np.nan, 1, 2, 0.5], 26, True),
-     ([np.nan, 1, 2, 3], 24, True), ([3, 1, 2, np.nan], 24, False)],
+    [
+        ([3, 2, 1, 2], 25, False),
+        ([1, 2, 3, 4], 23, True),
+        ([4, 3, 2, 1], 26, True),
+        ([np.nan, 1, 2, 0.5], 26, True),
+        ([np.nan, 1, 2, 3], 24, True),
+        ([3, 1, 2, np.nan], 24, False),
+    ],
 )
 def test_minimum_of_a_curve(curve, log_mu, edge):
     found = inversion.select_minimum("x", [23, 24, 25, 26], curve)

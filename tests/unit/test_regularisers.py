@@ -81,9 +81,7 @@ def test_exponential_runs_from_white_to_gradient():
 
 
 def test_weights_let_the_profile_bend_where_the_reference_is_strong():
-    weighted = WeightedLaplacian(
-        reference_z=("0 m", "2670 m"), reference_cn2=("1e-13 m^(-2/3)", "1e-15 m^(-2/3)")
-    )
+    weighted = WeightedLaplacian(reference_z=("0 m", "2670 m"), reference_cn2=("1e-13 m^(-2/3)", "1e-15 m^(-2/3)"))
     strength = 10 ** (-13 - 2 * GRID.centres / 2670)
     weight = strength / np.sqrt(np.mean(strength**2))
     bends = (X[2:] - 2 * X[1:-1] + X[:-2]) / weight[1:-1]
