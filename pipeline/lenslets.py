@@ -270,9 +270,9 @@ def boxes(grid: LensletGrid, frame_shape: tuple[int, int]) -> Boxes:
             origin[axis] = frame_shape[axis] - last
     corner = origin + lit * pitch
     off = (corner < 0).any(axis=1) | (corner + pitch > frame_shape).any(axis=1)
-    if off.all():
-        faults.append("no box lies on the detector")
-    elif off.any():
+    if 2 * off.sum() > len(off):
+        faults.append(f"{int(off.sum())} of {len(off)} boxes of {pitch[0]} x {pitch[1]} pixels lie off the detector")
+    if off.any() and not off.all():
         mask[tuple(lit[off].T)] = False
         notes.append(f"{int(off.sum())} lenslets with light are left out: their boxes reach beyond the detector")
         drift = drift[~off]

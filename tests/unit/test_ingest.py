@@ -719,3 +719,14 @@ def test_no_grid_is_told_and_drawn(tmp_path: Path) -> None:
     done = CliRunner().invoke(cli, ["inspect", str(tmp_path / "a.npy"), "--find-grid", "-o", str(tmp_path / "g.png")])
     assert "a grid needs 4" in str(done.exception)
     assert (tmp_path / "g.png").exists()
+
+
+def test_the_header_file_of_the_page_works(tmp_path: Path) -> None:
+    page = (Path(__file__).resolve().parents[2] / "docs" / "ingest.md").read_text()
+    (tmp_path / "header.toml").write_text(page.split("```toml\n")[1].split("```")[0])
+    as_fits(tmp_path / "dark.fits", np.zeros((4, 200, 180), np.uint16))
+    as_fits(tmp_path / "frames.fits", np.ones((30, 200, 180), np.uint16))
+    plan = plan_ingest([tmp_path / "frames.fits"], tmp_path / "header.toml")
+    assert plan.frame_shape == (160, 160)
+    assert plan.time[1] - plan.time[0] == round(1e9 / 142)
+    assert plan.planes["dark"].shape == (160, 160)
