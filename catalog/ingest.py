@@ -822,10 +822,13 @@ def _exact(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
             return False
         bounds = np.iinfo(dtype)
         return not values.size or (bounds.min <= values.min().item() and values.max().item() <= bounds.max)
+    if values.dtype.kind in "iub" and (not values.size or (values.min() >= -(2**24) and values.max() <= 2**24)):
+        return True
     with np.errstate(over="ignore"):
         there = values.astype(dtype)
-    back = there.astype(np.longdouble)
-    same = back == values.astype(np.longdouble)
+    # A double holds everything but 64-bit integers, and floats that are wider still.
+    wide = np.float64 if values.dtype.itemsize <= (8 if values.dtype.kind == "f" else 4) else np.longdouble
+    same = there.astype(wide) == values.astype(wide)
     return bool(np.all(same | ((values != values) & (there != there))))
 
 
