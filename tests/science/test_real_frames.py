@@ -1,7 +1,9 @@
 """Lenslet grids on real frames of wavefront sensors, and on simulated recordings whose header is known.
 
-What is expected of each real frame was read off its picture: kind of the array, pitch between neighbouring spots,
-direction. The number of lenslets with light is soft at the border of the pupil.
+The table of real frames is what the finder gave once its overlays had been looked at, frame by frame: it guards against
+change. That the steps are right is shown by the autocorrelation of the frame, which knows nothing of spots. The number
+of lenslets with light is soft at the border of the pupil. The limits between frames with faint spots and evenly lit
+lenslets were set with these frames at hand, and no others are there to test them.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from coslidar.catalog.archive import open_archive
 from coslidar.catalog.ingest import mean_frame
@@ -74,6 +77,30 @@ def test_grid_of_a_real_frame(shared_data: Path, name: str) -> None:
     assert (not found.faults) == fits, found.faults
     if not fits:
         assert ("hexagonal" if kind == "hexagonal" else "must be good to 1 px") in found.faults[0]
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_steps_of_a_real_frame_are_peaks_of_its_autocorrelation(shared_data: Path, name: str) -> None:
+    image = picture(shared_data, name)
+    grid = find_grid(image)
+    reach = 0.5 * min(grid.pitch)
+    clipped = np.clip(image, *np.quantile(image, [0.02, 0.995]))  # cosmic rays correlate with themselves alone
+    # Background and envelope of the pupil are wider than a step: without them its periods remain.
+    fine = ndimage.gaussian_filter(clipped, 1) - ndimage.gaussian_filter(clipped, reach)
+    power = np.abs(np.fft.rfft2(fine, [2 * n for n in image.shape])) ** 2
+    correlation = np.fft.fftshift(np.fft.irfft2(power, [2 * n for n in image.shape]))
+    zero = np.array(image.shape)
+    half = int(0.35 * min(grid.pitch))
+    for vector in grid.vectors:
+        centre = zero + np.rint(vector).astype(int)
+        near = correlation[centre[0] - half : centre[0] + half + 1, centre[1] - half : centre[1] + half + 1]
+        top = np.unravel_index(np.argmax(near), near.shape)
+        # Whole pixels, on a triangle of overlaps that pulls a wide peak inwards.
+        assert np.hypot(*(np.array(top) - half + centre - zero - vector)) < 1.5
+        # Not a multiple of the step: were half of it a period, the frame would agree with itself there at least as well.
+        assert near.max() > 0.4 * correlation.max()
+        middle = zero + np.rint(vector / 2).astype(int)
+        assert correlation[tuple(middle)] < 0.6 * near.max()
 
 
 @pytest.mark.parametrize("name", BLANK)
