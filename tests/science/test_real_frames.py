@@ -97,7 +97,7 @@ def test_steps_of_a_real_frame_are_peaks_of_its_autocorrelation(shared_data: Pat
         top = np.unravel_index(np.argmax(near), near.shape)
         # Whole pixels, on a triangle of overlaps that pulls a wide peak inwards.
         assert np.hypot(*(np.array(top) - half + centre - zero - vector)) < 1.5
-        # Not a multiple of the step: were half of it a period, the frame would agree with itself there at least as well.
+        # No multiple of a step: were half of it a period, the frame would agree with itself there at least as well.
         assert near.max() > 0.4 * correlation.max()
         middle = zero + np.rint(vector / 2).astype(int)
         assert correlation[tuple(middle)] < 0.6 * near.max()
