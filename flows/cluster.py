@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import os
+import re
+import socket
 import warnings
 from collections import OrderedDict
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from socket import gethostname
 from threading import Lock
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from ..catalog.archive import ArchiveError, ChunkError, open_archive
 from ..pipeline import batch as stages
 from ..pipeline.extraction import Calibration
 from ..pipeline.units import safe
-from .settings import Unavailable
+from .settings import InputError, Unavailable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -180,7 +182,7 @@ def process_batch(task: BatchTask, model: Model) -> BatchOutcome:
         what = (
             "the archive cannot be opened there: " if isinstance(error, ArchiveError) else f"{type(error).__name__}: "
         )
-        reason = f"worker on {gethostname()}: {what}{safe(str(error))}"
+        reason = f"worker on {socket.gethostname()}: {what}{safe(str(error))}"
         result = stages.failed(window.start_time, window.stop_time, reason)
     read = 0 if task.reduced is not None else window.stop - window.start
     return BatchOutcome(window, result, new, read, transient=transient, lasting=lasting)
@@ -199,6 +201,58 @@ def _cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+def scheduler_address(scheduler: str) -> str:
+    """Address of a scheduler, and a look whether anything listens there.
+
+    Dask itself tries for long, and ends badly where there is nothing.
+
+    Parameters
+    ----------
+    scheduler : str
+        Address, or path of a scheduler file.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    InputError
+        It is neither.
+    Unavailable
+        Nothing listens there.
+    """
+    address, path = scheduler, Path(scheduler)
+    if path.is_file():
+        try:
+            address = str(json.loads(path.read_text("utf-8"))["address"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(
+                [f"run.scheduler = {scheduler!r}: this is no scheduler file, as 'dask scheduler' writes one"]
+            ) from error
+    match = re.fullmatch(r"(?P<protocol>[a-z]+)://\[?(?P<host>[^\s\[\]]+?)\]?:(?P<port>\d{1,5})", address)
+    if match is None:
+        raise InputError(
+            [
+                f"run.scheduler = {scheduler!r}: this is neither an address nor a file that is there; write the "
+                "address of a Dask scheduler ('tcp://10.0.0.1:8786', 'tls://…'), or the path of its scheduler file"
+            ]
+        )
+    if match["protocol"] in ("tcp", "tls", "ws", "wss"):
+        try:
+            socket.create_connection((match["host"], int(match["port"])), PATIENCE).close()
+        except (OSError, OverflowError) as error:
+            raise _no_scheduler(address, error) from error
+    return address
+
+
+def _no_scheduler(address: str, error: Exception) -> Unavailable:
+    return Unavailable(
+        f"no Dask scheduler answers at {address} ({safe(str(error))}); start one with 'dask scheduler', or leave "
+        "--scheduler out to compute on this machine"
+    )
+
+
 @contextmanager
 def connect(run: RunParameters) -> Iterator[Client]:
     """A Dask client: threads of this process, or a cluster by address or scheduler file.
@@ -214,6 +268,8 @@ def connect(run: RunParameters) -> Iterator[Client]:
 
     Raises
     ------
+    InputError
+        What should be an address is none.
     Unavailable
         No scheduler answers, it has no worker, or its workers run other versions.
     """
@@ -238,21 +294,13 @@ def connect(run: RunParameters) -> Iterator[Client]:
                 worker_dashboard_address="127.0.0.1:0",
             )
         else:
-            is_file = Path(run.scheduler).is_file()
+            address = scheduler_address(run.scheduler)
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", VersionMismatchWarning)  # we refuse, and say more
-                    client = Client(
-                        address=None if is_file else run.scheduler,
-                        scheduler_file=run.scheduler if is_file else None,
-                        timeout=PATIENCE,
-                        set_as_default=False,
-                    )
+                    client = Client(address, timeout=PATIENCE, set_as_default=False)
             except (OSError, ValueError, TimeoutError) as error:
-                raise Unavailable(
-                    f"no Dask scheduler answers at {run.scheduler} ({type(error).__name__}: {error}); start one with "
-                    "'dask scheduler', or leave --scheduler out to compute on this machine"
-                ) from error
+                raise _no_scheduler(address, error) from error
         try:
             if run.scheduler is not None:
                 check_workers(client, run.scheduler)

@@ -184,28 +184,47 @@ def _blind(folder: Path) -> Path:
     return path
 
 
-def test_no_scheduler(
-    main_here: Callable[..., Finished], recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cluster, "PATIENCE", 1)
+def test_no_scheduler(main_here: Callable[..., Finished], recordings: list[str], tmp_path: Path) -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-        done = main_here(*run_arguments(recordings, tmp_path / "out", "--scheduler", address))
-    assert done.code == 1
+        (tmp_path / "scheduler.json").write_text(f'{{"address": "{address}"}}')
+        for scheduler in (address, tmp_path / "scheduler.json"):
+            done = main_here(*run_arguments(recordings, tmp_path / "out", "--scheduler", scheduler))
+            assert done.code == 1
+            (line,) = done.err.splitlines()
+            assert f"no Dask scheduler answers at {address}" in line
+            assert "Connection refused" in line
+            assert "start one with 'dask scheduler'" in line
+            assert done.seconds < 10
+
+
+@pytest.mark.parametrize(
+    "scheduler",
+    ["nonsense", "tcp://", "there/is/no/file.json", "tcp://127.0.0.1:notaport", "127.0.0.1:8786", "bad.json"],
+)
+def test_what_is_no_address(
+    scheduler: str, main_here: Callable[..., Finished], recordings: list[str], tmp_path: Path
+) -> None:
+    (tmp_path / "bad.json").write_text('{"id": 3}')
+    done = main_here(*run_arguments(recordings, tmp_path / "out", "--scheduler", scheduler))
+    assert done.code == 2
     (line,) = done.err.splitlines()
-    assert f"no Dask scheduler answers at {address}" in line
-    assert "dask scheduler" in line
+    assert f"run.scheduler = '{scheduler}': this is n" in line
+    assert "scheduler file" in line
 
 
-@pytest.mark.parametrize("scheduler", ["nonsense", "tcp://", "there/is/no/file.json", "tcp://127.0.0.1:notaport"])
-def test_what_is_no_address(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cluster, "PATIENCE", 1)
-    with (
-        pytest.raises(Unavailable, match="no Dask scheduler answers"),
-        cluster.connect(RunParameters(scheduler=scheduler)),
-    ):
-        pass
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:8786", "tls://[::1]:8786", "ucx://node-3.cluster:8786"])
+def test_what_is_an_address(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[tuple[str, int]] = []
+
+    def connection(where: tuple[str, int], timeout: float) -> SimpleNamespace:
+        asked.append(where)
+        return SimpleNamespace(close=lambda: None)
+
+    monkeypatch.setattr(cluster.socket, "create_connection", connection)
+    assert cluster.scheduler_address(address) == address
+    assert asked in ([], [("127.0.0.1", 8786)], [("::1", 8786)])
 
 
 class FakeClient:
