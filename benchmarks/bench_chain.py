@@ -1,7 +1,7 @@
 """The whole chain against reading and decoding the same archive, in one run on as many threads.
 
 Prints the CPU and wall time of both, where the rest goes, and last on its last line the ratio of the chain's time to
-the time of reading alone. Usage: python benchmarks/bench_chain.py [--frames 12780] [--repeat 3] [--codec lz4]
+the time of reading alone. Usage: python benchmarks/bench_chain.py [--frames 51120] [--repeat 3] [--codec lz4]
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def timed(work: object, *arguments: object) -> tuple[float, float]:
 def main(argv: list[str] | None = None) -> float:
     """Run the benchmark and return the ratio of wall times."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=12_780, help="frames of the recording (142 Hz)")
-    parser.add_argument("--batch", type=float, default=0.75, help="length of a batch in minutes")
+    parser.add_argument("--frames", type=int, default=51_120, help="frames of the recording (142 Hz)")
+    parser.add_argument("--batch", type=float, default=3.0, help="length of a batch in minutes")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--codec", choices=["lz4", "zstd"], default="lz4")
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
