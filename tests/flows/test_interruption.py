@@ -110,8 +110,9 @@ def test_interrupt_without_prefect(
         finish(coslidar, arguments, out, undisturbed, kept)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.cluster
+@pytest.mark.slow
 def test_interrupt_with_prefect(number: signal.Signals, started: Start, recordings: list[str], tmp_path: Path) -> None:
     out = tmp_path / "out"
     process = started(*run_arguments(recordings, out, "--set", "run.threads=1", prefect=True))
