@@ -35,14 +35,17 @@ class Kept:
     ----------
     folder : path
         Made when the first result is saved.
+    what : str
+        What is kept, for messages.
     """
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
+    def __init__(self, folder: str | os.PathLike[str], what: str = "result") -> None:
         self.folder = Path(folder)
+        self._what = what
 
     def path(self, key: Key | str) -> Path:
         """File of a result."""
-        digest = check_digest(str(key), "key of a result")
+        digest = check_digest(str(key), f"key of a {self._what}")
         return self.folder / digest[:2] / f"{digest}.npz"
 
     def has(self, key: Key | str) -> bool:

@@ -6,10 +6,8 @@ cut a file may be damaged, and a damaged file is no file.
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 from time import time
@@ -18,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..pipeline.products import COORDINATES, SCHEMA, BatchResult
-from .products import check_digest, temporary_name
+from .kept import Kept
 
 if TYPE_CHECKING:
     from ..pipeline.lineage import Key
@@ -41,6 +39,7 @@ class Scratch:
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
+        self._kept = Kept(folder, "batch")
 
     def path(self, key: Key | str) -> Path:
         """File of a batch.
@@ -50,8 +49,7 @@ class Scratch:
         coslidar.catalog.products.ProductError
             The key is not 64 hexadecimal digits.
         """
-        digest = check_digest(str(key), "key of a batch")
-        return self.folder / digest[:2] / f"{digest}.npz"
+        return self._kept.path(key)
 
     def save(self, key: Key | str, result: BatchResult) -> None:
         """Keep a finished batch.
@@ -68,7 +66,6 @@ class Scratch:
         OSError
             The file cannot be written.
         """
-        target = self.path(key)
         meta = {
             "format": _FORMAT,
             "key": str(key),
@@ -81,15 +78,7 @@ class Scratch:
         arrays = {name: np.asarray(value) for name, value in result.values.items()}
         if _META in arrays or any(value.dtype.hasobject for value in arrays.values()):
             raise ValueError("a batch holds plain arrays only")
-        packed = io.BytesIO()
-        np.savez(packed, allow_pickle=False, **{_META: np.array(json.dumps(meta)), **arrays})
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = target.parent / temporary_name()
-        try:
-            temporary.write_bytes(packed.getvalue())
-            os.replace(temporary, target)
-        finally:
-            temporary.unlink(missing_ok=True)
+        self._kept.save(key, {_META: np.array(json.dumps(meta)), **arrays})
 
     def load(self, key: Key | str) -> BatchResult | None:
         """A batch that was finished earlier.
@@ -104,17 +93,17 @@ class Scratch:
         BatchResult or None
             None where it is not there, damaged, of another key, or holds what a product does not know.
         """
-        path = self.path(key)
+        values = self._kept.load(key)
+        if values is None:
+            return None
         try:
-            with np.load(path, allow_pickle=False) as packed:
-                meta = json.loads(str(packed[_META]))
-                if meta["format"] != _FORMAT or meta["key"] != str(key):
-                    return None
-                values = {name: packed[name] for name in packed.files if name != _META}
+            meta = json.loads(str(values.pop(_META)))
+            if meta["format"] != _FORMAT or meta["key"] != str(key):
+                return None
             result = BatchResult(
                 int(meta["start"]), int(meta["stop"]), values, int(meta["quality_flag"]), str(meta["reason"])
             )
-        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+        except (ValueError, KeyError, TypeError):
             return None
         known = all(name in SCHEMA or name in COORDINATES for name in values)
         return result if known and sorted(values) == meta["names"] else None
