@@ -16,7 +16,7 @@ from coslidar.flows.simulate import simulate
 from coslidar.pipeline.lineage import checkout
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def _fixed_code() -> Iterator[None]:
     """Keys do not depend on what is being edited in this checkout meanwhile; see :func:`environment`."""
     before = os.environ.get("GIT_DIR")
