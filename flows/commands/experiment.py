@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from .recovery import recovery
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
@@ -21,9 +23,13 @@ _PROFILES = ("strong", "weak", "bright-last", "rough", "empty", "single")
 def experiment() -> None:
     """Try priors, selectors and error bars on data whose truth is known.
 
-    Everything is synthetic: correlations of a known profile for the instrument of Sauvage et al. 2021 (20 lenslets of
-    7 cm, two lamps at 2670 m, 3.8 um, 25,560 frames) with convergence noise drawn from its theoretical covariance.
+    For gcv and compare the data are correlations of a known profile for the instrument of Sauvage et al. 2021 (20
+    lenslets of 7 cm, two lamps at 2670 m, 3.8 um, 25,560 frames) with convergence noise drawn from its theoretical
+    covariance. recovery simulates frames of any instrument, and tries the whole chain on them.
     """
+
+
+experiment.add_command(recovery)
 
 
 def _shared(draws: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
