@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from coslidar.pipeline.extraction import Calibration, SpotLayout, extract, layout, reference_image
+from coslidar.pipeline.extraction import Calibration, SpotLayout, extract
 from coslidar.pipeline.parameters import ExtractionParameters, Header
+from coslidar.pipeline.spot_layout import layout, reference_image
 
 MASK = [[0, 1, 1, 1, 0], [1, 1, 1, 1, 1], [1, 1, 0, 1, 1], [1, 1, 1, 1, 1], [0, 1, 1, 1, 0]]
 SPOTS = [[9.95, 15.5], [21.05, 15.5]]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import checks, convergence, correlation, extraction, inversion, noise, posterior, timing, turbulence, vibration
+from . import checks, convergence, correlation, extraction, inversion, noise, posterior, spot_layout, timing, turbulence, vibration
 from .geometry import MAP_KINDS
 from .parameters import SOURCES_USED
 from .products import INTENSITY_KINDS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
@@ -138,9 +138,9 @@ def measure(
 
     def begin() -> extraction.SpotLayout:
         head = np.concatenate(waiting)
-        mean = extraction.reference_image(head[: parameters.reference_frames])
+        mean = spot_layout.reference_image(head[: parameters.reference_frames])
         try:
-            found = extraction.layout(header, mean, calibration, parameters)
+            found = spot_layout.layout(header, mean, calibration, parameters)
         except ValueError as error:
             raise BatchError(str(error)) from error
         parts.append(extraction.extract(head, found, calibration, parameters))

@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from coslidar.pipeline.extraction import Calibration, SpotLayout, extract, layout, reference_image
+from coslidar.pipeline.extraction import Calibration, SpotLayout, extract
 from coslidar.pipeline.parameters import ExtractionParameters, Header
+from coslidar.pipeline.spot_layout import layout, reference_image
 
 FRAMES = 50
 METHODS = {

@@ -18,15 +18,9 @@ import zarr
 from numpy.typing import NDArray
 from zarr.storage import ZipStore
 
-from coslidar.pipeline.extraction import (
-    Calibration,
-    SpotLayout,
-    extract,
-    layout,
-    reference_image,
-    response_to_tilt,
-)
+from coslidar.pipeline.extraction import Calibration, SpotLayout, extract, response_to_tilt
 from coslidar.pipeline.parameters import ExtractionParameters, Header
+from coslidar.pipeline.spot_layout import layout, reference_image
 
 Array = NDArray[Any]
 

@@ -10,16 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from coslidar.pipeline.extraction import (
-    FLAGS,
-    Calibration,
-    SpotLayout,
-    extract,
-    layout,
-    reference_image,
-    response_to_tilt,
-)
+from coslidar.pipeline.extraction import FLAGS, Calibration, SpotLayout, extract, response_to_tilt
 from coslidar.pipeline.parameters import ExtractionParameters, Header
+from coslidar.pipeline.spot_layout import layout, reference_image
 
 Array = NDArray[Any]
 

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coslidar.pipeline.extraction import Calibration, SpotLayout, extract, layout
+from coslidar.pipeline.extraction import Calibration, SpotLayout, extract
 from coslidar.pipeline.noise import flux_noise_variance, pixel_noise_variance, slope_noise_variance
 from coslidar.pipeline.parameters import ExtractionParameters, Header
+from coslidar.pipeline.spot_layout import layout
 
 LAYOUT = SimpleNamespace(boxes=np.array([[0, 0], [0, 20], [20, 0]]), pitch=(20, 20))
 

@@ -1,0 +1,337 @@
+"""Where the spots lie: found on a mean frame, with windows, mean spots and everything that frames are measured with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+
+from .bad_pixels import fill, light_on, no_bad_pixels, predictors
+from .extraction import measure_boxes, search_region
+from .spots import FLAGS, Calibration, SpotLayout
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from .parameters import ExtractionParameters, Header
+
+    Floats = NDArray[np.float64]
+
+#: Part of a spot's light on bad pixels above which it is not measured.
+BAD_LIGHT = 0.3
+#: Along the line of sources, part of their distance that a window may cover.
+ALONG = 0.9
+#: Across, and for a single source, size of the window in units of the spot's full width at half maximum.
+ACROSS = 6.6
+
+
+def reference_image(frames: NDArray[Any]) -> Floats:
+    """Mean of frames, from which the spots' positions are taken.
+
+    Parameters
+    ----------
+    frames : ndarray, (n, row, col)
+        Raw counts.
+
+    Returns
+    -------
+    ndarray of float64, (row, col)
+
+    Raises
+    ------
+    ValueError
+        There are no frames.
+    """
+    if frames.ndim != 3 or not frames.size:
+        raise ValueError(f"frames of shape {frames.shape}: (time, row, col) with at least one frame is needed")
+    mean: Floats = np.mean(frames, axis=0, dtype=np.float64)
+    return mean
+
+
+def layout(
+    header: Header, mean_frame: ArrayLike, calibration: Calibration, parameters: ExtractionParameters
+) -> SpotLayout:
+    """Find the spots on a mean frame and prepare the measurement.
+
+    Parameters
+    ----------
+    header : Header
+        Header of the archive: lenslet boxes, nominal spots, pixel scale.
+    mean_frame : array_like, (row, col)
+        Mean of raw frames, see `reference_image`.
+    calibration : Calibration
+        Dark, flat, bad pixels, saturation.
+    parameters : ExtractionParameters
+        Method, window and search.
+
+    Returns
+    -------
+    SpotLayout
+
+    Raises
+    ------
+    ValueError
+        A lenslet box lies outside the frame, a calibration array differs in shape from the frame, or the window
+        does not fit into a box.
+    """
+    instrument = header.instrument
+    mean_frame = np.asarray(mean_frame, dtype=np.float64)
+    rows, cols = instrument.lenslet_pitch
+    boxes = np.argwhere(np.asarray(instrument.subaperture_mask) != 0) * (rows, cols) + instrument.lenslet_origin
+    needed = boxes.max(axis=0) + np.array([rows, cols])
+    if (needed > mean_frame.shape).any():
+        raise ValueError(
+            f"the lenslet boxes need {needed[0]} x {needed[1]} pixels, "
+            f"but a frame has {mean_frame.shape[0]} x {mean_frame.shape[1]}"
+        )
+    nominal = np.array([source.spot for source in header.sources], dtype=np.float64)
+    signal, scale, offset, bad = _calibrated_boxes(mean_frame, boxes, (rows, cols), calibration, nominal)
+
+    # First guess: everything at its nominal place, bad pixels as in the typical box.
+    typical = _typical_box(signal, bad)
+    filled = fill(signal, bad, typical)
+    fwhm = _full_width(_typical_box(filled, np.zeros_like(bad)), nominal)
+    window = _window(parameters, nominal, (rows, cols), fwhm)
+    spots = np.repeat(nominal[:, None, :], len(boxes), axis=1)
+    start, index, neighbour, weight = no_bad_pixels(len(boxes))
+    bands, band_scale, band_offset = _bands(boxes, scale, offset)
+    first = SpotLayout(
+        boxes=boxes,
+        pitch=(rows, cols),
+        frame_shape=(mean_frame.shape[0], mean_frame.shape[1]),
+        pixel_scale=instrument.pixel_scale,
+        spots=spots,
+        flux=np.zeros(spots.shape[:2]),
+        window=window,
+        fwhm=fwhm,
+        template=np.repeat(typical[None], len(nominal), axis=0),
+        centre=nominal,
+        search=search_region(spots, (rows, cols), parameters.search),
+        bands=bands,
+        scale=band_scale,
+        offset=band_offset,
+        suspect=_lowest_saturated(scale, offset, calibration.saturation),
+        bad_start=start,
+        bad_index=index,
+        bad_neighbour=neighbour,
+        bad_weight=weight,
+        excluded=np.zeros(spots.shape[:2], dtype=np.uint8),
+    )
+    # Second: positions on the filled mean boxes, then templates of spots brought to one place.
+    spots, _ = measure_boxes(first, filled, parameters)
+    spots = np.where(np.isfinite(spots), spots, first.spots)
+    template, centre = _templates(filled, bad, spots)
+    start, index, neighbour, weight = predictors(bad, spots, template, centre)
+    for box, begin, end in zip(range(len(boxes)), start[:-1], start[1:], strict=True):
+        flat_box = filled[box].reshape(-1)
+        flat_box[index[begin:end]] = 0.0
+        flat_box[index[begin:end]] = np.einsum(
+            "bn,bn->b", weight[begin:end], flat_box[neighbour[begin:end]].astype(np.float64)
+        )
+    spots, flux = measure_boxes(replace(first, spots=spots), filled, parameters)
+    missing: NDArray[np.bool_] = np.logical_not(np.isfinite(spots).all(axis=-1))
+    spots = np.where(missing[..., None], first.spots, spots)
+    excluded = np.where(missing | ~_has_spot(filled, spots, window), FLAGS["no_spot"], 0) | np.where(
+        light_on(bad, spots, template, centre, window) > BAD_LIGHT, FLAGS["bad_pixels"], 0
+    )
+    return replace(
+        first,
+        spots=spots,
+        flux=np.nan_to_num(flux),
+        template=template,
+        centre=centre,
+        search=search_region(spots, (rows, cols), parameters.search),
+        bad_start=start,
+        bad_index=index,
+        bad_neighbour=neighbour,
+        bad_weight=weight,
+        excluded=excluded.astype(np.uint8),
+    )
+
+
+def _cut(image: NDArray[Any], boxes: NDArray[np.int64], pitch: tuple[int, int]) -> NDArray[Any]:
+    return np.stack([image[r : r + pitch[0], c : c + pitch[1]] for r, c in boxes])
+
+
+def _calibrated_boxes(
+    mean_frame: Floats,
+    boxes: NDArray[np.int64],
+    pitch: tuple[int, int],
+    calibration: Calibration,
+    nominal: Floats,
+) -> tuple[Floats, NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Calibrated mean boxes, scale, offset (A, rows, cols), and which pixels are bad."""
+    for name in ("dark", "flat", "bad_pixel"):
+        array = getattr(calibration, name)
+        if array is not None and np.shape(array) != mean_frame.shape:
+            raise ValueError(f"{name} has shape {np.shape(array)}, but a frame has {mean_frame.shape}")
+    raw = _cut(mean_frame, boxes, pitch)
+    flat = np.ones_like(raw) if calibration.flat is None else _cut(np.asarray(calibration.flat, float), boxes, pitch)
+    dark = np.zeros_like(raw) if calibration.dark is None else _cut(np.asarray(calibration.dark, float), boxes, pitch)
+    bad = ~(np.isfinite(raw) & np.isfinite(dark) & np.isfinite(flat) & (flat > 0))
+    if calibration.bad_pixel is not None:
+        bad |= _cut(np.asarray(calibration.bad_pixel, bool), boxes, pitch)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.where(bad, 0.0, 1.0 / flat)
+        offset = np.where(bad, 0.0, dark / flat)
+        signal = np.where(bad, 0.0, raw) * scale - offset
+    if calibration.dark is None:
+        background = np.stack([_plane(box, hole, nominal) for box, hole in zip(signal, bad, strict=True)])
+        background = np.where(bad, 0.0, background)
+        offset, signal = offset + background, signal - background
+    return signal, scale.astype(np.float32), offset.astype(np.float32), bad
+
+
+def _plane(box: Floats, bad: NDArray[np.bool_], nominal: Floats) -> Floats:
+    """Plane through the pixels of a box that hold no light, (rows, cols).
+
+    Diffraction wings reach far along the rows and columns through a spot: those are left out; what remains is
+    clipped three times at three standard deviations.
+    """
+    rows, cols = np.indices(box.shape)
+    near = np.zeros(box.shape, dtype=bool)
+    for row, col in nominal:
+        near |= (np.abs(rows - row) < box.shape[0] / 8) | (np.abs(cols - col) < box.shape[1] / 8)
+    for row, col in nominal:
+        near |= np.hypot(rows - row, cols - col) < min(box.shape) / 4
+    used = ~near & ~bad
+    if used.sum() < max(12, box.size // 20):
+        used = ~bad
+        used[1:-1, 1:-1] = False
+    if not used.any():
+        return np.zeros(box.shape)
+    basis = np.stack([np.ones(box.shape), rows - rows.mean(), cols - cols.mean()], axis=-1)
+    if used.sum() < 12:
+        basis = basis[..., :1]
+    for _ in range(4):
+        coefficients = np.linalg.lstsq(basis[used], box[used], rcond=None)[0]
+        residual = box - basis @ coefficients
+        spread = 1.4826 * float(np.median(np.abs(residual[used] - np.median(residual[used]))))
+        kept = used & (np.abs(residual) <= 3.0 * spread)
+        if spread == 0.0 or kept.sum() < basis.shape[-1] + 3:
+            break
+        used = kept
+    plane: Floats = basis @ coefficients
+    return plane
+
+
+def _typical_box(signal: Floats, bad: NDArray[np.bool_]) -> Floats:
+    """Mean over the subapertures of the good pixels; what is bad everywhere comes from its surroundings."""
+    count = (~bad).sum(axis=0)
+    mean: Floats = np.where(bad, 0.0, signal).sum(axis=0) / np.maximum(count, 1)
+    if (count == 0).any():
+        weight = ndimage.gaussian_filter((count > 0).astype(float), 1.0)
+        smooth = ndimage.gaussian_filter(np.where(count > 0, mean, 0.0), 1.0) / np.maximum(weight, 1e-12)
+        mean = np.where(count > 0, mean, smooth)
+    return mean
+
+
+def _full_width(box: Floats, nominal: Floats) -> float:
+    """Diameter of the circle with the area of the spot above half its maximum, mean over the sources, px."""
+    fine = 8
+    widths = []
+    for row, col in nominal:
+        reach = min(box.shape) // 4
+        offsets = np.arange(-reach, reach + 0.5 / fine, 1.0 / fine)
+        patch = ndimage.map_coordinates(
+            box, np.stack(np.meshgrid(row + offsets, col + offsets, indexing="ij")), order=3, mode="nearest"
+        )
+        labels, _ = ndimage.label(patch > 0.5 * patch.max())
+        area = (labels == labels.flat[int(np.argmax(patch))]).sum() / fine**2
+        widths.append(2.0 * math.sqrt(area / math.pi))
+    return float(np.mean(widths))
+
+
+def _window(
+    parameters: ExtractionParameters, nominal: Floats, pitch: tuple[int, int], fwhm: float
+) -> tuple[float, float]:
+    """Size (along y, along x) of the window, px."""
+    # Room for the spot to move: the window must stay inside the box wherever the spot is looked for. Rounded to an
+    # odd number, so that the seeing of the moment does not change the window from one batch to the next.
+    edge = np.minimum(nominal + 0.5, np.array(pitch) - 0.5 - nominal).min(axis=0)
+    room = np.maximum(2.0 * (edge - parameters.search), edge)
+    size = np.minimum(2.0 * np.round((ACROSS * fwhm - 1.0) / 2.0) + 1.0, room)
+    if len(nominal) == 1:
+        size[:] = size.min()
+    else:
+        distance = np.abs(nominal[1] - nominal[0])
+        along = int(np.argmax(distance))
+        size[along] = min(room[along], ALONG * distance[along])
+    if parameters.method == "moving_maximum":
+        size[:] = size.min()
+    given = (parameters.window_y, parameters.window_x)
+    height, width = (float(g) if g is not None else float(a) for g, a in zip(given, size, strict=True))
+    if parameters.method == "moving_maximum":
+        # The largest odd number of whole pixels that is not larger.
+        height, width = (max(2.0 * math.floor((side - 1.0) / 2.0) + 1.0, 1.0) for side in (height, width))
+    if height >= pitch[0] or width >= pitch[1]:
+        raise ValueError(f"a window of {height:g} x {width:g} px does not fit into a box of {pitch[0]} x {pitch[1]} px")
+    return height, width
+
+
+def _templates(filled: Floats, bad: NDArray[np.bool_], spots: Floats) -> tuple[Floats, Floats]:
+    """Mean box of each source with its spots brought to one place, (S, rows, cols), and that place (S, 2)."""
+    centre = spots.mean(axis=1)
+    # A filled pixel and what the spline makes of its neighbours count for nothing.
+    weight = 1.0 - np.stack([ndimage.binary_dilation(hole, iterations=1) for hole in bad]).astype(float)
+    weight = np.maximum(weight, 1e-6)
+    template = np.empty((len(spots), *filled.shape[1:]))
+    for source in range(len(spots)):
+        moved = np.stack(
+            [
+                ndimage.shift(box, centre[source] - spot, order=3, mode="nearest")
+                for box, spot in zip(filled, spots[source], strict=True)
+            ]
+        )
+        template[source] = (moved * weight).sum(axis=0) / weight.sum(axis=0)
+    return template, centre
+
+
+def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDArray[np.bool_]:
+    """Whether the mean frame shows a spot: a maximum well above the scatter of the box's dark part, (S, A)."""
+    found = np.zeros(spots.shape[:2], dtype=bool)
+    rows, cols = np.indices(filled.shape[1:])
+    for box, image in enumerate(filled):
+        inside = [
+            (np.abs(rows - row) < window[0] / 2) & (np.abs(cols - col) < window[1] / 2) for row, col in spots[:, box]
+        ]
+        outside = image[~np.any(inside, axis=0)]
+        level = float(np.median(outside))
+        scatter = 1.4826 * float(np.median(np.abs(outside - level)))
+        for source, (row, col) in enumerate(spots[:, box]):
+            core = (np.abs(rows - row) <= 1.0) & (np.abs(cols - col) <= 1.0)
+            found[source, box] = float(image[core].mean()) - level > 5.0 * scatter and float(image[core].mean()) > level
+    return found
+
+
+def _lowest_saturated(
+    scale: NDArray[np.float32], offset: NDArray[np.float32], saturation: float | None
+) -> NDArray[np.float32]:
+    """Lowest calibrated value that a saturated pixel of each box can have, (A,)."""
+    if saturation is None:
+        return np.full(len(scale), np.inf, dtype=np.float32)
+    level = np.where(scale > 0, saturation * scale - offset, np.inf)
+    lowest: NDArray[np.float32] = level.min(axis=(1, 2)).astype(np.float32)
+    # Rounding of the calibrated value must not hide a saturated pixel.
+    lowest -= np.abs(lowest) * np.float32(1e-5)
+    return lowest
+
+
+def _bands(
+    boxes: NDArray[np.int64], scale: NDArray[np.float32], offset: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Rows of lenslets, and scale and offset of the detector rows that they share."""
+    rows, first = np.unique(boxes[:, 0], return_index=True)
+    last = np.append(first[1:], len(boxes)) - 1
+    left, width = boxes[first, 1], boxes[last, 1] - boxes[first, 1] + scale.shape[2]
+    bands = np.stack([rows, left, width, first], axis=1).astype(np.int64)
+    joined = np.zeros((2, len(rows), scale.shape[1], width.max()), dtype=np.float32)
+    for box, (row, column) in enumerate(boxes):
+        band = int(np.searchsorted(rows, row))
+        columns = slice(column - left[band], column - left[band] + scale.shape[2])
+        joined[0, band, :, columns] = scale[box]
+        joined[1, band, :, columns] = offset[box]
+    return bands, joined[0], joined[1]
