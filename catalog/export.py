@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,8 +25,8 @@ from .products import TIME_UNITS, temporary_name
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-#: Units that UDUNITS cannot read.
-_BEYOND_UDUNITS = ("m^(-2/3)", "m^(4/3)")
+#: What UDUNITS cannot read: powers that are no whole number.
+_BEYOND_UDUNITS = re.compile(r"\^\([^)]*/")
 #: Columns that tell the rows of a table apart.
 _IDENTITY = ("campaign", "archive", "lineage_key")
 
@@ -296,7 +297,7 @@ def export_netcdf(datasets: Sequence[xr.Dataset], path: str | os.PathLike[str], 
         for flags in ("flag_masks", "flag_values"):
             if flags in variable.attrs:
                 variable.attrs[flags] = np.asarray(variable.attrs[flags], dtype=variable.dtype)
-        if strict and variable.attrs.get("units") in _BEYOND_UDUNITS:
+        if strict and _BEYOND_UDUNITS.search(variable.attrs.get("units", "")):
             unit = variable.attrs.pop("units")
             variable.attrs["comment"] = f"in {unit}, a unit that UDUNITS cannot read"
     target = Path(path)

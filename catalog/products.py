@@ -50,13 +50,14 @@ CONVENTIONS = "CF-1.11"
 TIME_UNITS = "nanoseconds since 1970-01-01T00:00:00"
 _TIME_DTYPE = np.dtype("datetime64[ns]")
 
-#: Coordinates that are names: dimension -> what they name. `source` is named by the archive.
+#: Coordinates that are names: dimension -> what they name. Those without a list are named by the archive.
 _LABELS: dict[str, tuple[str, tuple[str, ...] | None]] = {
     "slope_kind": ("axis and pairing of a slope map", SLOPE_KINDS),
     "intensity_kind": ("pairing of a scintillation map", INTENSITY_KINDS),
     "axis": ("axis of a slope", ("x", "y")),
     "axis_kind": ("signal: slope along x, slope along y, intensity", ("x", "y", "i")),
     "source": ("name of the source", None),
+    "scintillometer": ("name of a scintillometer on the same path", None),
 }
 #: Results that hold for the wavelength of the instrument only.
 _AT_WAVELENGTH = (
@@ -135,6 +136,7 @@ def assemble(
     lineage: lineages.Key | Mapping[str, Any],
     wavelength: float,
     sources: Sequence[str],
+    scintillometers: Sequence[str] = (),
     attributes: Mapping[str, Any] | None = None,
     provenance: Mapping[str, Any] | None = None,
 ) -> xr.Dataset:
@@ -156,8 +158,8 @@ def assemble(
         Key of the product, or its lineage document.
     wavelength : float
         Wavelength of the instrument, m.
-    sources : sequence of str
-        Names of the sources.
+    sources, scintillometers : sequence of str
+        Names of the sources, and of the scintillometers on the path if there are any.
     attributes : mapping, optional
         Further global attributes: text, numbers, or lists of them.
     provenance : mapping, optional
@@ -190,10 +192,11 @@ def assemble(
     if "z" in fixed:
         fixed["z_true"] = fixed["z"]
 
+    named = {"source": sources} | ({"scintillometer": scintillometers} if scintillometers else {})
     sizes = {
         "time": len(ordered),
         "bound": 2,
-        "source": len(sources),
+        **{name: len(labels) for name, labels in named.items()},
         **{name: len(labels) for name, (_, labels) in _LABELS.items() if labels is not None},
         **{name: value.size for name, value in fixed.items() if name in COORDINATES},
     }
@@ -212,7 +215,7 @@ def assemble(
     dataset = dataset.assign_coords(time=("time", bounds[:, 0].view(_TIME_DTYPE)))
     for dim, (_, labels) in _LABELS.items():
         if dim in dataset.dims:
-            names = sources if labels is None else labels
+            names = named[dim] if labels is None else labels
             dataset = dataset.assign_coords({dim: (dim, np.array([str(name) for name in names]))})
     _describe(dataset, wavelength)
 

@@ -21,7 +21,7 @@ from ..catalog.archive import ArchiveError
 from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
-from ..pipeline import response
+from ..pipeline import description, response
 from ..pipeline.products import QUALITY_FLAGS
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
@@ -187,6 +187,9 @@ def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
         regulariser=plan.regulariser,
         selector=plan.selector,
         inversion=work.settings.configuration.inversion,
+        scintillometers=description.scintillometer_weights(
+            plan.header, plan.grid, work.settings.configuration.response.sampling
+        ),
     )
 
 
@@ -274,19 +277,14 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     header = plan.header
     dataset = assemble(
         results,
-        {
-            "z": plan.grid.centres,
-            "z_bounds": np.stack([plan.grid.edges[:-1], plan.grid.edges[1:]], axis=1),
-            "dy": plan.geometry.lags[:, 0, 1] * plan.geometry.subaperture_size,
-            "dx": plan.geometry.lags[0, :, 0] * plan.geometry.subaperture_size,
-            "pair_count": plan.geometry.pair_count,
-        },
+        description.describe(model_of(plan, work), header),
         campaign=header.campaign,
         archive=header.archive,
         archive_identity=plan.archive.identity,
         lineage=plan.profile_key,
         wavelength=header.instrument.wavelength,
         sources=plan.source_names,
+        scintillometers=[scintillometer.name for scintillometer in header.scintillometers],
         attributes=attributes_of(plan, work.settings),
     )
     published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes)

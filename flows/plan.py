@@ -9,6 +9,7 @@ import numpy as np
 
 from ..catalog.archive import open_archive
 from ..pipeline import batch as stages
+from ..pipeline import description
 from ..pipeline.lineage import Key, checkout, make_key
 from ..pipeline.parameters import SOURCES_USED
 from ..pipeline.units import safe
@@ -233,7 +234,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
     profile = make_key(
         "profile",
         stages.RETRIEVE_VERSION,
-        tracked=configuration.inversion.model_dump(),
+        tracked={**configuration.inversion.model_dump(), **description.tracked(header)},
         plugins={"regulariser": regulariser.identity(), "selector": selector.identity()},
         upstream=[reduction, responses],
         mark=mark,

@@ -8,15 +8,29 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import checks, convergence, correlation, extraction, inversion, noise, posterior, spot_layout, timing, turbulence, vibration
+from . import (
+    checks,
+    convergence,
+    correlation,
+    extraction,
+    inversion,
+    noise,
+    posterior,
+    spot_layout,
+    timing,
+    turbulence,
+    uncertainty,
+    vibration,
+)
 from .geometry import MAP_KINDS
 from .parameters import SOURCES_USED
-from .products import INTENSITY_KINDS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
+from .products import INTENSITY_KINDS, MU_FACTORS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -34,9 +48,9 @@ if TYPE_CHECKING:
 
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
-REDUCE_VERSION = 2
+REDUCE_VERSION = 3
 RESPONSE_VERSION = 1
-RETRIEVE_VERSION = 3
+RETRIEVE_VERSION = 4
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
@@ -88,6 +102,8 @@ class Model:
         Plugins.
     inversion : InversionParameters
         Data used, unpenalised unknowns, estimator.
+    scintillometers : ndarray, (n, k)
+        Weight of each slice in the Cn2 of each scintillometer on the path; n = 0 without any.
     """
 
     geometry: Geometry
@@ -97,6 +113,7 @@ class Model:
     regulariser: Regulariser
     selector: HyperparameterSelector
     inversion: InversionParameters
+    scintillometers: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
 
 
 def measure(
@@ -307,6 +324,7 @@ def reduce(
             "vibration_frequency": np.asarray(line.frequency),
             "vibration_variance": line.variance,
             "vibration_significance": np.asarray(line.significance),
+            "slope_spectrum": vibration.spectrum(common, frame_rate),
             "zernike_variance": modes.variance,
             "zernike_variance_kolmogorov": modes.kolmogorov,
             "zernike_misfit": modes.misfit,
@@ -372,9 +390,10 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
             around.append(_whitened(other, model).problem(*_known(other, model), grid=grid))
     try:
+        reduction, known = _whitened(reduced, model), _known(reduced, model)
         profile = inversion.estimate(
-            _whitened(reduced, model),
-            *_known(reduced, model),
+            reduction,
+            *known,
             model.selector,
             grid=grid,
             neighbours=around,
@@ -382,6 +401,10 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
             # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
             seed=reduced.start // 1_000_000 % 2**31,
         )
+        problem = reduction.problem(*known, grid=grid)
+        others = profile.mu * np.array(MU_FACTORS)
+        other_cn2 = np.stack([inversion.solve_positive(problem, mu) for mu in others])
+        other_error = np.stack([uncertainty.map_error(problem, mu) for mu in others])
     except (ValueError, np.linalg.LinAlgError) as error:
         raise BatchError(f"the inversion failed: {error}") from error
 
@@ -427,6 +450,8 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "resolution_length": profile.resolution_length,
         "cn2_path_mean": path_mean(profile.cn2),
         "cn2_path_mean_interval_68": interval(path_mean),
+        "cn2_other_mu": other_cn2,
+        "cn2_other_mu_standard_error": other_error,
         "cn2_at_bound": profile.at_bound,
         "averaging_kernel": profile.averaging_kernel,
         "degrees_of_freedom": profile.degrees_of_freedom,
@@ -457,6 +482,10 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "valid_fraction": arrays["valid_fraction"],
         "chi2_reduced": profile.chi2_reduced,
     }
+    if len(model.scintillometers):
+        averages = [partial(turbulence.path_average, weights=weights) for weights in model.scintillometers]
+        values["cn2_path_average"] = np.array([average(profile.cn2) for average in averages])
+        values["cn2_path_average_interval_68"] = np.stack([interval(average) for average in averages])
     # Checks that were made with the correlations.
     values |= {name: value for name, value in arrays.items() if name in SCHEMA and name not in values}
     negative = any(

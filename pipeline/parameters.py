@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from contextvars import ContextVar
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -276,6 +277,25 @@ class Path(HeaderPart):
 
     length: PathLength = Field(gt=0)
     height: Length | None = None
+    """Mean height above ground."""
+    heights: tuple[tuple[Length, Annotated[Length, Field(gt=0)]], ...] | None = None
+    """(z, height of the line of sight above ground at z), z from the pupil and increasing."""
+
+    @field_validator("heights")
+    @classmethod
+    def _increasing(cls, heights: tuple[tuple[float, float], ...] | None) -> tuple[tuple[float, float], ...] | None:
+        if heights is not None and (len(heights) < 2 or any(a[0] >= b[0] for a, b in pairwise(heights))):
+            raise ValueError("list at least two pairs of distance and height, with increasing distance from the pupil")
+        return heights
+
+
+class Scintillometer(HeaderPart):
+    """A large-aperture scintillometer on the same path, for comparison."""
+
+    name: Text
+    wavelength: Wavelength = Field(gt=0)
+    diameters: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
+    """Of its apertures, at the pupil's end and at the sources' end."""
 
 
 class Source(HeaderPart):
@@ -335,6 +355,7 @@ class Header(HeaderPart):
     path: Path
     sources: tuple[Source, ...]
     site: Site | None = None
+    scintillometers: tuple[Scintillometer, ...] = ()
 
     @model_validator(mode="wrap")
     @classmethod
@@ -360,6 +381,20 @@ class Header(HeaderPart):
             if sources[0].position == sources[1].position:
                 raise ValueError("both sources are at the same position; their separation is what profiles the path")
         return sources
+
+    @field_validator("scintillometers")
+    @classmethod
+    def _told_apart(cls, scintillometers: tuple[Scintillometer, ...]) -> tuple[Scintillometer, ...]:
+        names = [scintillometer.name for scintillometer in scintillometers]
+        if len(set(names)) < len(names):
+            raise ValueError("two of them have one name; give each a name of its own")
+        return scintillometers
+
+    @model_validator(mode="after")
+    def _finite_for_scintillometers(self) -> Header:
+        if self.scintillometers and math.isinf(self.path.length):
+            raise ValueError("scintillometers need a path of finite length")
+        return self
 
     @model_validator(mode="after")
     def _texts_and_spots(self) -> Header:

@@ -92,6 +92,9 @@ RADIAL_ORDERS = (1, 2, 3, 4, 5)
 #: Width and centres of the bins of the log-amplitude histogram.
 LOG_AMPLITUDE_STEP = 0.01
 LOG_AMPLITUDES: NDArray[np.float64] = (np.arange(200) - 99.5) / 100
+#: Parts of the chosen mu at which a profile is retrieved as well, to show what depends on it (Sauvage et al. 2021,
+#: Sec. 4.3).
+MU_FACTORS = (0.01, 100.0)
 
 #: Coordinates of a product.
 COORDINATES = _schema(
@@ -103,18 +106,28 @@ COORDINATES = _schema(
     ("log_mu_grid", "log_mu_grid", "1", "float64", "log10 of the hyperparameter mu in m^(4/3)"),
     ("radial_order", "radial_order", "1", "int64", "radial order of Zernike modes"),
     ("log_amplitude", "log_amplitude", "1", "float64", "log-amplitude chi = ln(i / mean i) / 2, middle of a bin"),
+    ("mu_factor", "mu_factor", "1", "float64", "mu of another profile, relative to the chosen one"),
+    ("frequency", "frequency", "Hz", "float64", "temporal frequency, middle of a cell of the spectrum"),
 )
 
 #: Coordinates that are the same in every product.
 FIXED_COORDINATES: dict[str, NDArray[np.generic]] = {
     "radial_order": np.array(RADIAL_ORDERS, dtype=np.int64),
     "log_amplitude": LOG_AMPLITUDES,
+    "mu_factor": np.array(MU_FACTORS),
 }
 
 #: Every other variable of a product, schema version 1.
 SCHEMA = _schema(
     ("time_bounds", "time bound", "ns", "int64", "start and end of the batch"),
     ("z_bounds", "z bound", "m", "float64", "borders of the slices"),
+    ("z_max", "", "m", "float64", "largest distance at which both sources share turbulence, of two sources"),
+    ("z_first", "", "m", "float64", "distance that triangulation tells from the pupil, of two sources"),
+    ("fresnel_scale", "z", "m", "float64", "size sqrt(lambda z L / (L - z)) of the scintillation on the pupil"),
+    ("height_above_ground", "z", "m", "float64", "height of the line of sight above ground"),
+    ("scintillometer_weight", "scintillometer z", "1", "float64", "part of a slice in the Cn2 of a scintillometer"),
+    ("response_slope", "slope_kind dy dx z", "rad^2 m^(2/3)", "float64", "slope maps per Cn2 of a slice"),
+    ("response_intensity", "intensity_kind dy dx z", "m^(2/3)", "float64", "scintillation maps per Cn2 of a slice"),
     ("cn2", "time z", "m^(-2/3)", "float64", "refractive index structure parameter Cn2"),
     ("cn2_standard_error", "time z", "m^(-2/3)", "float64", "MAP error bar of Cn2"),
     ("cn2_standard_error_ml", "time z", "m^(-2/3)", "float64", "maximum-likelihood error bar of Cn2"),
@@ -124,6 +137,16 @@ SCHEMA = _schema(
     ("resolution_length", "time z", "m", "float64", "length of path that an estimate stands for"),
     ("cn2_path_mean", "time", "m^(-2/3)", "float64", "mean of Cn2 along the path"),
     ("cn2_path_mean_interval_68", "time bound", "m^(-2/3)", "float64", "shortest interval of it holding 68 %"),
+    ("cn2_path_average", "time scintillometer", "m^(-2/3)", "float64", "mean of Cn2 as a scintillometer weights it"),
+    (
+        "cn2_path_average_interval_68",
+        "time scintillometer bound",
+        "m^(-2/3)",
+        "float64",
+        "shortest interval of it holding 68 %",
+    ),
+    ("cn2_other_mu", "time mu_factor z", "m^(-2/3)", "float64", "most probable profile at another mu"),
+    ("cn2_other_mu_standard_error", "time mu_factor z", "m^(-2/3)", "float64", "MAP error bar of cn2_other_mu"),
     ("cn2_at_bound", "time z", "1", "uint8", "1 where the positivity constraint is active"),
     ("averaging_kernel", "time z z_true", "1", "float64", "response of the retrieved to the true profile"),
     ("degrees_of_freedom", "time", "1", "float64", "degrees of freedom for signal"),
@@ -160,6 +183,7 @@ SCHEMA = _schema(
     ("centroid_gain", "time source axis", "1", "float64", "response of the slopes to a known tilt of the mean spot"),
     ("vibration_frequency", "time", "Hz", "float64", "vibration line, at its alias if above half the frame rate"),
     ("vibration_variance", "time axis", "rad^2", "float64", "variance of the slopes by the vibration line"),
+    ("slope_spectrum", "time axis frequency", "rad^2/Hz", "float64", "spectral density of the pupil-mean slopes"),
     ("vibration_significance", "time", "1", "float64", "strongest line over the continuum, in its deviations"),
     ("zernike_variance", "time source radial_order", "rad^2", "float64", "variance per mode of phase, noise removed"),
     (

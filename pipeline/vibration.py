@@ -34,6 +34,8 @@ HALF_WIDTH, RELATIVE = 2.0, 0.05
 BRIDGE = 0.2
 #: Lines are looked for from here on, Hz: below, the turbulent tilt has a slope that looks like one.
 LOWEST = 5.0
+#: Most cells of the spectrum that a product keeps; of fast sensors they are wider than `CELL`.
+MOST_CELLS = 400
 #: Chance that a spectrum without a line passes as one with.
 FALSE_ALARM = 1e-6
 
@@ -82,16 +84,11 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
     """
     nothing = Vibration(np.nan, np.zeros(2), np.nan)
     missing = ~np.isfinite(tilt).all(axis=1)
-    length = int(fft.prev_fast_len(len(tilt) - 1)) if len(tilt) > 4096 else len(tilt) - 1
+    length = _length(len(tilt))
     per_cell = int(CELL * length / frame_rate)
     if per_cell < 1 or frame_rate / 2 < LOWEST + SURROUNDINGS or missing.mean() > 0.5:
         return nothing
-    values = np.asarray(tilt, dtype=np.float64)
-    if missing.any():
-        values = _bridged(values, missing, max(round(BRIDGE * frame_rate), 3))
-    frequency = np.arange(length // 2 + 1) * frame_rate / length
-    power = np.abs(fft.rfft(np.diff(values, axis=0)[:length], axis=0)) ** 2 * (2 / length**2)
-    power[1:] /= 4 * np.sin(np.pi * frequency[1:, None] / frame_rate) ** 2
+    frequency, power = _periodogram(tilt, missing, frame_rate)
 
     cells = len(power) // per_cell
     cell = power[: cells * per_cell].reshape(cells, per_cell, 2).mean(axis=1)
@@ -126,6 +123,67 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
         inside = int(half * length / frame_rate)
         variance /= cuts[0] + 2 * cuts[1 : inside + 1].sum()
     return Vibration(centre, variance, significance)
+
+
+def cells(frame_rate: float) -> Floats:
+    """Middles of the cells of :func:`spectrum`, Hz: equally wide up to half the frame rate, at most `MOST_CELLS`."""
+    count = int(frame_rate / 2 / _width(frame_rate))
+    return (np.arange(max(count, 1)) + 0.5) * _width(frame_rate)
+
+
+def spectrum(tilt: NDArray[np.floating], frame_rate: float) -> Floats:
+    """Temporal power spectral density of the mean slopes.
+
+    Parameters
+    ----------
+    tilt : ndarray, (T, 2)
+        As for :func:`find_line`.
+    frame_rate : float
+        Hz.
+
+    Returns
+    -------
+    ndarray, (2, n)
+        One-sided density along x and y in each of :func:`cells`, rad^2/Hz: its integral over frequency is the variance.
+        NaN where the record is too short to tell a cell from the next, or less than half of it is there. The lowest
+        cell also holds what two ends of a record that do not meet make of it.
+    """
+    centres = cells(frame_rate)
+    missing = ~np.isfinite(tilt).all(axis=1)
+    found = np.full((2, len(centres)), np.nan)
+    length = _length(len(tilt))
+    if length < 2 or missing.mean() > 0.5:
+        return found
+    frequency, power = _periodogram(tilt, missing, frame_rate)
+    # Frequency zero holds the mean slope, which is no variance.
+    number = (frequency[1:] / _width(frame_rate)).astype(np.int64)
+    for axis in range(2):
+        total = np.bincount(number, power[1:, axis], minlength=len(centres))[: len(centres)]
+        count = np.bincount(number, minlength=len(centres))[: len(centres)]
+        found[axis, count > 0] = total[count > 0] / count[count > 0] * length / frame_rate
+    return found
+
+
+def _width(frame_rate: float) -> float:
+    """Width of a cell of the recorded spectrum, Hz."""
+    return float(CELL * np.ceil(frame_rate / 2 / CELL / MOST_CELLS))
+
+
+def _length(frames: int) -> int:
+    """Steps between frames that are transformed; a length with a large prime factor would take long."""
+    return int(fft.prev_fast_len(frames - 1)) if frames > 4096 else frames - 1
+
+
+def _periodogram(tilt: NDArray[np.floating], missing: NDArray[np.bool_], frame_rate: float) -> tuple[Floats, Floats]:
+    """Frequencies in Hz, and the variance of both axes at each of them, from the steps between frames."""
+    length = _length(len(tilt))
+    values = np.asarray(tilt, dtype=np.float64)
+    if missing.any():
+        values = _bridged(values, missing, max(round(BRIDGE * frame_rate), 3))
+    frequency = np.arange(length // 2 + 1) * frame_rate / length
+    power = np.abs(fft.rfft(np.diff(values, axis=0)[:length], axis=0)) ** 2 * (2 / length**2)
+    power[1:] /= 4 * np.sin(np.pi * frequency[1:, None] / frame_rate) ** 2
+    return frequency, power
 
 
 def _bridged(values: Floats, missing: NDArray[np.bool_], width: int) -> Floats:

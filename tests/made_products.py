@@ -20,11 +20,11 @@ def batch(number=0, seed=0, *, slices=4, grid=5, flag=0):
     random = np.random.default_rng([seed, number])
     sizes = {"z": slices, "z_true": slices, "log_mu_grid": grid, "slope_kind": 4, "intensity_kind": 2}
     sizes |= {name: len(value) for name, value in FIXED_COORDINATES.items()}
-    sizes |= {"dy": 5, "dx": 3, "source": 2, "axis": 2, "axis_kind": 3, "bound": 2}
+    sizes |= {"dy": 5, "dx": 3, "source": 2, "axis": 2, "axis_kind": 3, "bound": 2, "scintillometer": 1, "frequency": 6}
     values = {
         name: (10 * random.random([sizes[dim] for dim in variable.dims[1:]])).astype(variable.dtype)
         for name, variable in SCHEMA.items()
-        if variable.dims[0] == "time" and name not in _OWN and all(dim in sizes for dim in variable.dims[1:])
+        if variable.dims[:1] == ("time",) and name not in _OWN and all(dim in sizes for dim in variable.dims[1:])
     }
     values["log_mu_grid"] = np.linspace(25.0, 29.0, grid)
     return BatchResult(START + number * LENGTH, START + (number + 1) * LENGTH, values, flag)
@@ -41,7 +41,15 @@ def static(slices=4):
         "z_bounds": np.stack([edges[:-1], edges[1:]], axis=1),
         "dy": np.arange(-2, 3) * 0.07,
         "dx": np.arange(-1, 2) * 0.07,
+        "frequency": np.arange(6) + 0.5,
         "pair_count": np.arange(15).reshape(5, 3),
+        "z_max": np.asarray(692.0),
+        "z_first": np.asarray(214.8),
+        "fresnel_scale": np.linspace(0.01, 0.1, slices),
+        "height_above_ground": np.linspace(10.0, 30.0, slices),
+        "scintillometer_weight": np.full((1, slices), 1 / slices),
+        "response_slope": np.linspace(0, 1, 60 * slices).reshape(4, 5, 3, slices),
+        "response_intensity": np.linspace(0, 1, 30 * slices).reshape(2, 5, 3, slices),
     }
 
 
@@ -59,6 +67,7 @@ def product(seed=0, results=None, **changes):
         "lineage": key(seed),
         "wavelength": 3.8e-6,
         "sources": ["bottom", "top"],
+        "scintillometers": ["LAS A"],
         "attributes": {"sampling": "mean"},
     } | changes
     batches = [batch(0, seed), batch(1, seed, flag=4), failed(2)] if results is None else results

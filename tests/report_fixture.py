@@ -136,7 +136,7 @@ def product(
         "quality_flag": np.where(index * 4 > 0.3, 256, 0).astype("i4"),
         "quality_level": np.where(index * 4 > 0.3, 1, 0).astype("i1"),
     }  # fmt: skip
-    # Checks that no figure shows yet.
+    # Checks that no figure shows.
     sizes = {"time": batches, "source": sources, "axis": 2, "axis_kind": 3}
     sizes |= {name: len(value) for name, value in FIXED_COORDINATES.items()}
     for name in sorted(set(SCHEMA) - set(values) - {"r0_direct"}):
@@ -144,7 +144,7 @@ def product(
     values["r0_direct"] = (0.13 * trend**-0.6)[:, None] * np.array([1.02, 0.98])[:sources]
     for batch in failed:
         for name, variable in SCHEMA.items():
-            if variable.dims[0] == "time" and variable.dtype == "float64":
+            if variable.dims[:1] == ("time",) and variable.dtype == "float64":
                 values[name][batch] = np.nan
         values["quality_flag"][batch], values["quality_level"][batch] = 1, 2
         values["cn2_at_bound"][batch] = 0

@@ -62,6 +62,7 @@ def retrieve(
         regulariser=White(),
         selector=selector or GCV(),
         inversion=InversionParameters(**inversion),
+        scintillometers=np.linspace(1, 2, matrix.shape[1])[None],
     )
     return batch.retrieve(reduced(maps, flux_variance), model)
 
@@ -69,16 +70,37 @@ def retrieve(
 def test_every_promised_variable_is_delivered(matrix: np.ndarray) -> None:
     found = retrieve(matrix, matrix @ np.full(6, CN2))
     sizes = {"z": 6, "z_true": 6, "dy": 9, "dx": 9, "bound": 2, "axis": 2, "source": 2, "axis_kind": 3,
-             "slope_kind": 4, "intensity_kind": 2, "log_mu_grid": 41}  # fmt: skip
+             "slope_kind": 4, "intensity_kind": 2, "log_mu_grid": 41, "mu_factor": 2, "scintillometer": 1}  # fmt: skip
     made_here = {
         name for name in SCHEMA if name.startswith(("cn2", "r0_profile", "r0_interval", "slope_", "intensity_"))
-    }
+    } - {"slope_spectrum"}
     made_here |= {"averaging_kernel", "degrees_of_freedom", "mu", "criterion", "resolution_length", "chi2_reduced",
                   "noise_variance_slope", "noise_variance_slope_error", "noise_variance_intensity",
                   "noise_variance_intensity_error", "scintillation_index_interval_68"}  # fmt: skip
     assert made_here <= set(found.values)
     for name in set(found.values) - {"log_mu_grid"}:
         assert found.values[name].shape == tuple(sizes[dim] for dim in SCHEMA[name].dims if dim != "time"), name
+
+
+def test_profiles_at_other_mu_are_those_of_that_mu(matrix: np.ndarray) -> None:
+    """A selector fixed at a hundred times more or less finds the same, with the same bars."""
+    maps = matrix @ np.linspace(0.5 * CN2, 2 * CN2, 6)
+    found = retrieve(matrix, maps, Fixed(mu="1e27 m^(4/3)")).values
+    for number, mu in enumerate(("1e25 m^(4/3)", "1e29 m^(4/3)")):
+        other = retrieve(matrix, maps, Fixed(mu=mu)).values
+        np.testing.assert_allclose(found["cn2_other_mu"][number], other["cn2"], rtol=1e-9)
+        np.testing.assert_allclose(found["cn2_other_mu_standard_error"][number], other["cn2_standard_error"], rtol=1e-9)
+    # A hundred times stronger a prior of zero mean pulls the profile toward zero.
+    assert found["cn2_other_mu"][1].sum() < found["cn2"].sum()
+
+
+def test_average_of_a_scintillometer_is_the_weighted_mean(matrix: np.ndarray) -> None:
+    found = retrieve(matrix, matrix @ np.full(6, CN2)).values
+    weight = np.linspace(1, 2, 6)
+    expected = (found["cn2"] * weight).sum() / weight.sum()
+    np.testing.assert_allclose(found["cn2_path_average"], [expected], rtol=1e-12)
+    low, high = found["cn2_path_average_interval_68"][0]
+    assert low < expected < high
 
 
 def test_intervals_hold_68_percent_of_a_known_posterior(matrix: np.ndarray) -> None:

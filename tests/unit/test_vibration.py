@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from coslidar.pipeline.vibration import LOWEST, find_line
+from coslidar.pipeline.vibration import LOWEST, MOST_CELLS, cells, find_line, spectrum
 
 RATE = 142.0
 
@@ -88,3 +88,45 @@ def test_records_that_cannot_tell() -> None:
         assert np.isnan(found.significance)
         assert (found.variance == 0).all()
     assert np.isnan(find_line(np.zeros((1000, 2)), RATE).frequency)
+
+
+def test_spectrum_of_white_noise_is_its_variance_over_the_band() -> None:
+    """Variance over half the frame rate; a cell of 90 periodogram values scatters by 1 / sqrt(90), 10.5 %.
+
+    In the first cell the jump between the ends of the record stands beside it: the spectrum is made for turbulence.
+    """
+    values = np.random.default_rng(5).normal(0, [1e-6, 2e-6], (25_560, 2))
+    found = spectrum(values, RATE)
+    assert found.shape == (2, len(cells(RATE))) == (2, 142)
+    for axis, variance in enumerate((1e-12, 4e-12)):
+        assert found[axis, 1:].mean() == pytest.approx(variance / (RATE / 2), rel=0.02)
+        assert (np.abs(found[axis, 1:] / (variance / (RATE / 2)) - 1) < 0.5).all()
+
+
+def test_spectrum_holds_the_variance_of_a_line_in_its_cell() -> None:
+    found = spectrum(tilt(25_560, 1) + line(25_560, 50.25, (1e-12, 4e-12)), RATE)
+    peak = int(np.argmin(np.abs(cells(RATE) - 50.25)))
+    assert cells(RATE)[peak] == pytest.approx(50.25)
+    # Turbulence and noise of 5e-8 leave 1e-17 of variance in a cell of 0.5 Hz.
+    assert found[:, peak] * 0.5 == pytest.approx([1e-12, 4e-12], rel=0.01)
+    assert (found[:, 90:100] * 0.5 < 1e-14).all()
+
+
+@pytest.mark.parametrize("rate", [0.4, 10.0, 142.0, 1000.0, 1e5])
+def test_cells_cover_the_spectrum_and_stay_few(rate: float) -> None:
+    middle = cells(rate)
+    assert 1 <= len(middle) <= MOST_CELLS
+    if rate > 1:
+        width = 2 * middle[0]
+        assert rate / 2 - width < middle[-1] + width / 2 <= rate / 2
+    assert spectrum(np.zeros((300, 2)), rate).shape == (2, len(middle))
+
+
+def test_spectrum_of_next_to_nothing_is_unknown() -> None:
+    assert np.isnan(spectrum(np.zeros((2, 2)), RATE)).all()
+    values = np.zeros((300, 2))
+    values[:160] = np.nan
+    assert np.isnan(spectrum(values, RATE)).all()
+    # A second of 142 frames: the periodogram has a value every hertz, every other cell none.
+    second = spectrum(np.random.default_rng(0).normal(size=(143, 2)), RATE)
+    assert 0.4 < np.isfinite(second).mean() < 0.6

@@ -1,0 +1,92 @@
+"""What a product says once: the geometry of its path, what its data answer to, and what else looks along it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import turbulence, vibration
+from .geometry import MAP_KINDS
+from .products import INTENSITY_KINDS, SLOPE_KINDS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .batch import Model
+    from .geometry import Geometry, SliceGrid
+    from .parameters import Header
+
+    Array = NDArray[np.float64]
+
+
+def tracked(header: Header) -> dict[str, Any]:
+    """What of a header enters a product beside geometry and detector."""
+    return {
+        "heights": header.path.heights,
+        "scintillometers": [(s.name, s.wavelength, s.diameters) for s in header.scintillometers],
+    }
+
+
+def scintillometer_weights(header: Header, grid: SliceGrid, sampling: turbulence.Sampling) -> Array:
+    """Weight of each slice in the Cn2 of each scintillometer of the header, (n, k); n = 0 without any."""
+    if not header.scintillometers:
+        return np.empty((0, grid.k))
+    return np.stack(
+        [
+            turbulence.scintillometer_weights(
+                grid, other.wavelength, header.path.length, *other.diameters, sampling=sampling
+            )
+            for other in header.scintillometers
+        ]
+    )
+
+
+def fresnel_scale(geometry: Geometry, z: Array) -> Array:
+    """Size of the scintillation that a layer at z prints on the pupil, m.
+
+    sqrt(lambda z L / (L - z)) in the spherical wave of a source at L (Sauvage et al. 2021, Sec. 3.2).
+    """
+    scaling = np.array([geometry.scaling(float(at)) for at in z])
+    return np.asarray(np.sqrt(geometry.wavelength * z * scaling))
+
+
+def describe(model: Model, header: Header) -> dict[str, NDArray[Any]]:
+    """Coordinates and variables of a product that do not change from batch to batch.
+
+    Parameters
+    ----------
+    model : Model
+        What turns reduced data into profiles.
+    header : Header
+        Header of the archive.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Under their names in :data:`coslidar.pipeline.products.COORDINATES` and
+        :data:`coslidar.pipeline.products.SCHEMA`. Heights and scintillometers only where the header has them.
+    """
+    geometry, grid = model.geometry, model.grid
+    d = geometry.subaperture_size
+    responses = model.matrix.reshape(len(MAP_KINDS), *geometry.map_shape, grid.k)
+    found: dict[str, NDArray[Any]] = {
+        "z": grid.centres,
+        "z_bounds": np.stack([grid.edges[:-1], grid.edges[1:]], axis=1),
+        "dy": geometry.lags[:, 0, 1] * d,
+        "dx": geometry.lags[0, :, 0] * d,
+        "frequency": vibration.cells(header.instrument.frame_rate),
+        "pair_count": geometry.pair_count,
+        "z_max": np.asarray(turbulence.z_max(geometry)),
+        "z_first": np.asarray(turbulence.resolution(geometry)),
+        "fresnel_scale": fresnel_scale(geometry, grid.centres),
+        "response_slope": responses[[MAP_KINDS.index(kind) for kind in SLOPE_KINDS]],
+        "response_intensity": responses[[MAP_KINDS.index(kind) for kind in INTENSITY_KINDS]],
+    }
+    if header.path.heights is not None:
+        at, height = np.array(header.path.heights).T
+        inside = (grid.centres >= at[0]) & (grid.centres <= at[-1])
+        found["height_above_ground"] = np.where(inside, np.interp(grid.centres, at, height), np.nan)
+    if header.scintillometers:
+        found["scintillometer_weight"] = model.scintillometers
+    return found
