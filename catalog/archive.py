@@ -22,7 +22,15 @@ from pydantic import ValidationError
 
 from ..pipeline.parameters import FORMAT, FORMAT_VERSION, Header, overlay, spot_faults, text_faults
 from ..pipeline.units import QuantityError, faults, parse, safe
-from .archive_codecs import ArraySpec, DamagedChunk, Missing, StoredArray, find_chunks, parse_array
+from .archive_codecs import (
+    ArraySpec,
+    DamagedChunk,
+    Missing,
+    StoredArray,
+    UnreachableChunk,
+    find_chunks,
+    parse_array,
+)
 from .archive_stores import Store, StoreError, open_store, shown
 
 #: Data types of frames.
@@ -81,15 +89,28 @@ class ChunkError(OSError):
         Key of the chunk.
     reason : str
         What is wrong with it.
+    transient : bool
+        Whether a network or server failed rather than the chunk, so that another try may succeed.
     """
 
-    def __init__(self, archive: str, chunk: str, reason: str) -> None:
-        super().__init__(archive, chunk, reason)
+    def __init__(self, archive: str, chunk: str, reason: str, transient: bool = False) -> None:
+        super().__init__(archive, chunk, reason, transient)
         self.archive = archive
         self.chunk = chunk
         self.reason = reason
+        self.transient = transient
+
+    @classmethod
+    def of(cls, archive: str, chunk: str, error: DamagedChunk) -> ChunkError:
+        """What to raise for a chunk that could not be fetched or decoded."""
+        return cls(archive, chunk, str(error), isinstance(error, UnreachableChunk))
 
     def __str__(self) -> str:
+        if self.transient:
+            return (
+                f"{self.archive}: {safe(self.chunk)}: this chunk cannot be reached: {safe(self.reason)}; it may be "
+                "whole: look at the network, and run again"
+            )
         return (
             f"{self.archive}: {safe(self.chunk)}: this chunk is damaged: {safe(self.reason)}; "
             "copy the archive again from where it was recorded"
@@ -226,7 +247,7 @@ class Archive:
         """
         if not 0 <= i < self.n_chunks:
             raise IndexError(f"there is no chunk {i}; the archive has chunks 0 to {self.n_chunks - 1}")
-        return self._frames.plane(i, lambda key, reason: ChunkError(shown(self.url), key, reason))
+        return self._frames.plane(i, lambda key, error: ChunkError.of(shown(self.url), key, error))
 
     def chunks(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[Any]]]:
         """Read a range of frames, one chunk in memory at a time.
@@ -285,7 +306,7 @@ class Archive:
                 try:
                     digest.update(self._frames.fetch(flat, verify=False))
                 except DamagedChunk as error:
-                    raise ChunkError(shown(self.url), self._frames.locate(flat)[0], str(error)) from error
+                    raise ChunkError.of(shown(self.url), self._frames.locate(flat)[0], error) from error
         return digest.hexdigest()
 
 
@@ -518,7 +539,7 @@ class _Opening:
 
     def _read(self, array: StoredArray) -> NDArray[Any] | None:
         try:
-            return array.whole(lambda key, reason: ChunkError(self.fault.origin, key, reason))
+            return array.whole(lambda key, error: ChunkError.of(self.fault.origin, key, error))
         except ChunkError as error:
             self.fault.sentences.append(str(error))
             return None

@@ -9,6 +9,7 @@ event loop.
 
 from __future__ import annotations
 
+import errno
 import math
 import struct
 import zlib
@@ -21,7 +22,7 @@ import numpy as np
 from numcodecs import blosc, zstd
 from numpy.typing import NDArray
 
-from .archive_stores import Store
+from .archive_stores import Store, UnreachableStore
 
 #: One chunk holds at most this many bytes uncompressed.
 MAX_CHUNK_BYTES = 256 * 2**20
@@ -38,6 +39,16 @@ Fault = Callable[[str, Any, str], None]
 
 class DamagedChunk(Exception):
     """A stored chunk that cannot be decoded; the message says why."""
+
+
+class UnreachableChunk(DamagedChunk):
+    """A stored chunk that cannot be fetched now; another try may find it whole."""
+
+
+#: What a network disk says when it is the network that fails.
+_UNREACHABLE = frozenset(
+    (errno.ESTALE, errno.ETIMEDOUT, errno.ENETDOWN, errno.ENETUNREACH, errno.EHOSTDOWN, errno.EHOSTUNREACH)
+)
 
 
 class Codec(Protocol):
@@ -360,7 +371,8 @@ class StoredArray:
         except FileNotFoundError as error:
             raise DamagedChunk("missing since the archive was opened") from error
         except OSError as error:
-            raise DamagedChunk(str(error)) from error
+            lost = isinstance(error, UnreachableStore) or error.errno in _UNREACHABLE
+            raise (UnreachableChunk if lost else DamagedChunk)(str(error)) from error
 
     def chunk(self, flat: int) -> NDArray[Any]:
         """Decode a chunk, with its padding beyond the end of the array.
@@ -372,7 +384,7 @@ class StoredArray:
         """
         return self.spec.chain.decode(self.fetch(flat), self.spec.chunk_shape, self.spec.dtype)
 
-    def plane(self, row: int, fault: Callable[[str, str], Exception]) -> NDArray[Any]:
+    def plane(self, row: int, fault: Callable[[str, DamagedChunk], Exception]) -> NDArray[Any]:
         """All chunks with index `row` along the first axis, put together and cut to the array's shape.
 
         Parameters
@@ -380,7 +392,7 @@ class StoredArray:
         row : int
             Index of the chunk along the first axis.
         fault : callable
-            ``fault(key, reason)`` gives the exception to raise for a damaged chunk.
+            ``fault(key, error)`` gives the exception to raise for a damaged chunk.
         """
         spec = self.spec
         first = row * spec.chunk_shape[0]
@@ -392,7 +404,7 @@ class StoredArray:
             try:
                 chunk = self.chunk(flat)
             except DamagedChunk as error:
-                raise fault(self.locate(flat)[0], str(error)) from error
+                raise fault(self.locate(flat)[0], error) from error
             if count == 1 and spec.chunk_shape[1:] == spec.shape[1:]:
                 return chunk[: shape[0]]
             if out is None:
@@ -404,7 +416,7 @@ class StoredArray:
         assert out is not None
         return out
 
-    def whole(self, fault: Callable[[str, str], Exception]) -> NDArray[Any]:
+    def whole(self, fault: Callable[[str, DamagedChunk], Exception]) -> NDArray[Any]:
         """The whole array; see :meth:`plane`."""
         return np.concatenate([self.plane(row, fault) for row in range(self.spec.grid[0])])
 

@@ -30,6 +30,10 @@ class StoreError(OSError):
     """The place that a URL names cannot be read as an archive's store; the message says why."""
 
 
+class UnreachableStore(StoreError):
+    """A network or its server fails: what was asked for may be whole, and another try may succeed."""
+
+
 class Store(Protocol):
     """Read-only map from keys (``"frames/c/0/0/0"``) to bytes."""
 
@@ -337,7 +341,10 @@ def _remote_read(fs: Any, path: str, key: str, start: int, size: int | None) -> 
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{key} does not exist") from error
     except Exception as error:
-        raise StoreError(f"{key} cannot be read ({_said(error)})") from error
+        raise UnreachableStore(f"{key} cannot be read ({_said(error)})") from error
     if size is not None and len(data) > size:
         raise StoreError("the server ignores byte ranges; download the archive and open the copy")
-    return data if size is None else _exact(data, size, key)
+    if size is not None and len(data) < size:
+        # The file was as long as it should be when the archive was opened.
+        raise UnreachableStore(f"{key} ended after {len(data)} of {size} bytes")
+    return data

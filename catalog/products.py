@@ -424,16 +424,43 @@ def product_bytes(dataset: xr.Dataset) -> bytes:
         The dataset differs from the schema, or an attribute cannot be written as JSON.
     """
     check(dataset)
-    members = {"zarr.json": _document({"zarr_format": 3, "node_type": "group", "attributes": dict(dataset.attrs)})}
+    arrays = {}
     for key, variable in dataset.variables.items():
-        name = str(key)
         attributes, values = dict(variable.attrs), np.asarray(variable.values)
         if values.dtype == _TIME_DTYPE:
             values = values.view(np.int64)
             attributes |= {"units": TIME_UNITS, "calendar": "standard"}
+        arrays[str(key)] = (values, tuple(str(name) for name in variable.dims), attributes)
+    return group_bytes(arrays, dict(dataset.attrs))
+
+
+def group_bytes(
+    arrays: Mapping[str, tuple[NDArray[Any], tuple[str, ...], Mapping[str, Any]]], attributes: Mapping[str, Any]
+) -> bytes:
+    """A zarr v3 group in a zip: the same bytes for the same content.
+
+    Parameters
+    ----------
+    arrays : mapping
+        Name -> values, dimensions, attributes.
+    attributes : mapping
+        Of the group.
+
+    Returns
+    -------
+    bytes
+        Members sorted, dated 1980-01-01, uncompressed; JSON sorted by key.
+
+    Raises
+    ------
+    ProductError
+        An attribute cannot be written as JSON.
+    """
+    members = {"zarr.json": _document({"zarr_format": 3, "node_type": "group", "attributes": dict(attributes)})}
+    for name, (values, dimensions, described) in arrays.items():
         specification, chunk = _array(values)
         members[f"{name}/zarr.json"] = _document(
-            {**specification, "attributes": attributes, "dimension_names": list(variable.dims)}
+            {**specification, "attributes": dict(described), "dimension_names": list(dimensions)}
         )
         if values.size:
             members["/".join([name, "c", *("0" * values.ndim)])] = chunk
