@@ -22,6 +22,7 @@ COMMANDS = {
     "plan": ("process", "Show what a run would read, compute and reuse."),
     "run": ("process", "Turn recordings into catalogued Cn2 profiles."),
     "report": ("results", "Draw one self-contained page of a campaign or product."),
+    "browse": ("browse", "Look through a catalog in a web browser."),
     "catalog": ("results", "List, show, export and check products."),
     "plugins": ("science", "List, describe and check installed plugins."),
     "response": ("science", "Compute the response matrix M of an instrument."),
