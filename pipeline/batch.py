@@ -20,9 +20,8 @@ from . import (
     correlation,
     extraction,
     inversion,
-    noise,
+    measurement,
     posterior,
-    spot_layout,
     timing,
     turbulence,
     uncertainty,
@@ -145,55 +144,12 @@ def measure(
     Raises
     ------
     BatchError
-        The mean frame shows no spots that can be measured.
+        See :func:`coslidar.pipeline.measurement.measure`.
     """
-    waiting: list[NDArray[Any]] = []
-    count = 0
-    layout: extraction.SpotLayout | None = None
-    parts: list[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]] = []
-    pixel_noise: list[float] = []
-
-    def begin() -> extraction.SpotLayout:
-        head = np.concatenate(waiting)
-        mean = spot_layout.reference_image(head[: parameters.reference_frames])
-        try:
-            found = spot_layout.layout(header, mean, calibration, parameters)
-        except ValueError as error:
-            raise BatchError(str(error)) from error
-        parts.append(extraction.extract(head, found, calibration, parameters))
-        pixel_noise.append(noise.pixel_noise_variance(head[: parameters.reference_frames], found, calibration))
-        return found
-
-    for block in blocks:
-        if layout is not None:
-            parts.append(extraction.extract(block, layout, calibration, parameters))
-            continue
-        waiting.append(block)
-        count += len(block)
-        if count >= parameters.reference_frames:
-            layout = begin()
-            waiting.clear()
-    if layout is None:
-        if not waiting:
-            raise BatchError("there is no frame")
-        layout = begin()
-    slopes, flux, flag = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a spot that is never measured has no mean
-        mean = np.nanmean(flux, axis=0)
-    height, width = layout.window
-    gain = header.instrument.gain
-    return Measurements(
-        time,
-        slopes,
-        flux,
-        flag,
-        flux_noise=noise.flux_noise_variance(mean, pixel_noise[0], height * width, gain),
-        slope_noise=noise.slope_noise_variance(
-            layout, flux[:: noise.EVERY], pixel_noise[0], gain, recentred=parameters.method != "moving_maximum"
-        ),
-        centroid_gain=extraction.response_to_tilt(layout, parameters),
-    )
+    try:
+        return measurement.measure(blocks, time, header, calibration, parameters)
+    except measurement.MeasurementError as error:
+        raise BatchError(str(error)) from error
 
 
 def reduce(

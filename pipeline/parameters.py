@@ -81,7 +81,10 @@ class ExtractionParameters(Parameters):
     search: Pixels = Field(default="4 pixel", ge=1)  # type: ignore[assignment]
     """How far from its mean position a spot is looked for, along each axis."""
     reference_frames: int = Field(default=256, ge=1)
-    """Frames at the start of a batch whose mean gives the fine position of the spots."""
+    """Frames whose mean gives the fine position of the spots: those at the start of a batch, or the first so many in
+    which both sources are lit."""
+    follow: Pixels = Field(default="1 pixel", gt=0)  # type: ignore[assignment]
+    """The spots are found again once those of a source have moved so far, on average over `reference_frames`."""
 
 
 #: Sources whose data are used -> their places in the header.

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
+#: A source of which this part of the spots is found is lit.
+LIT = 0.5
+#: Brightness of a spot's core, relative to the brighter source's in the same box, up to which it may be a wing of that.
+WING = 0.01
 #: Part of a spot's light on bad pixels above which it is not measured.
 BAD_LIGHT = 0.3
 #: Along the line of sources, part of their distance that a window may cover.
@@ -52,7 +56,13 @@ def reference_image(frames: NDArray[Any]) -> Floats:
 
 
 def layout(
-    header: Header, mean_frame: ArrayLike, calibration: Calibration, parameters: ExtractionParameters
+    header: Header,
+    mean_frame: ArrayLike,
+    calibration: Calibration,
+    parameters: ExtractionParameters,
+    *,
+    previous: SpotLayout | None = None,
+    moved: ArrayLike = 0.0,
 ) -> SpotLayout:
     """Find the spots on a mean frame and prepare the measurement.
 
@@ -66,6 +76,11 @@ def layout(
         Dark, flat, bad pixels, saturation.
     parameters : ExtractionParameters
         Method, window and search.
+    previous : SpotLayout, optional
+        An earlier layout of this recording. The spots are looked for where it has them, its window is kept, and so is
+        its knowledge of spots that the mean frame does not show.
+    moved : array_like, broadcast to (S, 2)
+        By how much (row, col) the spots have moved since, px.
 
     Returns
     -------
@@ -88,14 +103,22 @@ def layout(
             f"but a frame has {mean_frame.shape[0]} x {mean_frame.shape[1]}"
         )
     nominal = np.array([source.spot for source in header.sources], dtype=np.float64)
+    spots = np.repeat(nominal[:, None, :], len(boxes), axis=1)
+    if previous is not None:
+        spots = previous.spots + np.broadcast_to(np.asarray(moved), nominal.shape)[:, None]
+        nominal = np.median(spots, axis=1)
     signal, scale, offset, bad = _calibrated_boxes(mean_frame, boxes, (rows, cols), calibration, nominal)
 
     # First guess: everything at its nominal place, bad pixels as in the typical box.
     typical = _typical_box(signal, bad)
     filled = fill(signal, bad, typical)
-    fwhm = _full_width(_typical_box(filled, np.zeros_like(bad)), nominal)
-    window = _window(parameters, nominal, (rows, cols), fwhm)
-    spots = np.repeat(nominal[:, None, :], len(boxes), axis=1)
+    if previous is None:
+        whole = _typical_box(filled, np.zeros_like(bad))
+        shown = _has_spot(whole[None], nominal[:, None], (rows / 3, cols / 3))[:, 0]
+        fwhm = _full_width(whole, nominal[shown] if shown.any() else nominal)
+        window = _window(parameters, nominal, (rows, cols), fwhm)
+    else:
+        fwhm, window = previous.fwhm, previous.window
     start, index, neighbour, weight = no_bad_pixels(len(boxes))
     bands, band_scale, band_offset = _bands(boxes, scale, offset)
     first = SpotLayout(
@@ -124,6 +147,9 @@ def layout(
     spots, _ = measure_boxes(first, filled, parameters)
     spots = np.where(np.isfinite(spots), spots, first.spots)
     template, centre = _templates(filled, bad, spots)
+    if previous is not None:
+        dark = _has_spot(filled, spots, window).mean(axis=1) < LIT
+        template[dark], centre[dark] = previous.template[dark], previous.centre[dark]
     start, index, neighbour, weight = predictors(bad, spots, template, centre)
     for box, begin, end in zip(range(len(boxes)), start[:-1], start[1:], strict=True):
         flat_box = filled[box].reshape(-1)
@@ -137,10 +163,16 @@ def layout(
     excluded = np.where(missing | ~_has_spot(filled, spots, window), FLAGS["no_spot"], 0) | np.where(
         light_on(bad, spots, template, centre, window) > BAD_LIGHT, FLAGS["bad_pixels"], 0
     )
+    flux = np.nan_to_num(flux)
+    if previous is not None:
+        gone = (excluded & ~previous.excluded & FLAGS["no_spot"]) > 0
+        spots = np.where(gone[..., None], first.spots, spots)
+        flux = np.where(gone, previous.flux, flux)
+        excluded = np.where(gone, excluded & ~FLAGS["no_spot"], excluded)
     return replace(
         first,
         spots=spots,
-        flux=np.nan_to_num(flux),
+        flux=flux,
         template=template,
         centre=centre,
         search=search_region(spots, (rows, cols), parameters.search),
@@ -291,7 +323,10 @@ def _templates(filled: Floats, bad: NDArray[np.bool_], spots: Floats) -> tuple[F
 
 
 def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDArray[np.bool_]:
-    """Whether the mean frame shows a spot: a maximum well above the scatter of the box's dark part, (S, A)."""
+    """Whether the mean frame shows a spot, (S, A).
+
+    Its core is well above the scatter of the box's dark part, and brighter than a wing of the other source.
+    """
     found = np.zeros(spots.shape[:2], dtype=bool)
     rows, cols = np.indices(filled.shape[1:])
     for box, image in enumerate(filled):
@@ -301,9 +336,10 @@ def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDA
         outside = image[~np.any(inside, axis=0)]
         level = float(np.median(outside))
         scatter = 1.4826 * float(np.median(np.abs(outside - level)))
-        for source, (row, col) in enumerate(spots[:, box]):
-            core = (np.abs(rows - row) <= 1.0) & (np.abs(cols - col) <= 1.0)
-            found[source, box] = float(image[core].mean()) - level > 5.0 * scatter and float(image[core].mean()) > level
+        core = np.array(
+            [image[(np.abs(rows - row) <= 1.0) & (np.abs(cols - col) <= 1.0)].mean() for row, col in spots[:, box]]
+        )
+        found[:, box] = (core - level > 5.0 * scatter) & (core > level) & (core - level > WING * (core - level).max())
     return found
 
 
