@@ -1,8 +1,4 @@
-"""Tables of the catalog, for SQLite and PostgreSQL from one definition.
-
-Times are integers, ns since 1970-01-01T00:00:00 UTC, because both databases hold those alike. What a query asks for
-(time, quality, r0, scintillation) stands in the batch rows, so that no query opens a file.
-"""
+"""The database of a catalog: where it is, how it is opened, and how old tables become new ones."""
 
 from __future__ import annotations
 
@@ -19,9 +15,11 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine, make_url
 
 from ..pipeline.units import safe
+from .tables import SCHEMA_VERSION, metadata, schema_version
 
-#: Version of the tables.
-SCHEMA_VERSION = 1
+#: File in the folder of a catalog that names its database, where that is not the SQLite file beside it.
+URL_FILE = "database.url"
+DATABASE_FILE = "catalog.sqlite"
 #: How long a writer waits for another, s.
 BUSY_TIMEOUT = 60.0
 #: File systems on which several hosts see one file, and on which the shared memory of WAL does not work.
@@ -33,115 +31,79 @@ NETWORK_FILE_SYSTEMS = frozenset(
     )
 )
 
-metadata = sa.MetaData(
-    naming_convention={
-        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
-        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
-        "ck": "ck_%(table_name)s_%(constraint_name)s",
-        "fk": "fk_%(table_name)s_%(column_0_N_name)s",
-        "pk": "pk_%(table_name)s",
-    }
-)
-
-schema_version = sa.Table("schema_version", metadata, sa.Column("version", sa.Integer, primary_key=True))
-
-campaign = sa.Table(
-    "campaign",
-    metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("name", sa.String(100), nullable=False, unique=True),
-)
-
-archive = sa.Table(
-    "archive",
-    metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("campaign_id", sa.ForeignKey("campaign.id"), nullable=False, index=True),
-    sa.Column("name", sa.String(100), nullable=False, index=True),
-    sa.Column("identity", sa.String(64), nullable=False, unique=True),
-    sa.Column("url", sa.Text, nullable=False),
-    sa.Column("header", sa.JSON, nullable=False),
-    sa.CheckConstraint("length(identity) = 64", name="identity"),
-)
-
-lineage = sa.Table(
-    "lineage",
-    metadata,
-    sa.Column("key", sa.String(64), primary_key=True),
-    sa.Column("stage", sa.String(100), nullable=False),
-    sa.Column("document", sa.JSON, nullable=False),
-    sa.CheckConstraint("length(key) = 64", name="key"),
-)
-
-run = sa.Table(
-    "run",
-    metadata,
-    sa.Column("id", sa.String(32), primary_key=True),
-    sa.Column("started", sa.BigInteger, nullable=False, index=True),
-    sa.Column("finished", sa.BigInteger),
-    sa.Column("state", sa.String(20), nullable=False),
-    sa.Column("host", sa.Text, nullable=False),
-    sa.Column("process", sa.Integer, nullable=False),
-    sa.Column("command", sa.Text, nullable=False),
-    sa.Column("commit", sa.Text, nullable=False),
-    sa.Column("software", sa.JSON, nullable=False),
-    sa.Column("configuration", sa.JSON, nullable=False),
-    sa.CheckConstraint("state in ('running', 'finished', 'failed', 'cancelled', 'interrupted')", name="state"),
-)
-
-product = sa.Table(
-    "product",
-    metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("archive_id", sa.ForeignKey("archive.id"), nullable=False),
-    sa.Column("lineage_key", sa.ForeignKey("lineage.key"), nullable=False, index=True),
-    sa.Column("run_id", sa.ForeignKey("run.id"), index=True),
-    sa.Column("path", sa.String(400), nullable=False, unique=True),
-    sa.Column("sha256", sa.String(64), nullable=False),
-    sa.Column("size", sa.BigInteger, nullable=False),
-    sa.Column("published", sa.BigInteger, nullable=False),
-    sa.Column("start", sa.BigInteger, nullable=False, index=True),
-    sa.Column("stop", sa.BigInteger, nullable=False),
-    sa.Column("batches", sa.Integer, nullable=False),
-    sa.UniqueConstraint("archive_id", "lineage_key"),
-    sa.CheckConstraint("length(sha256) = 64", name="sha256"),
-)
-
-batch = sa.Table(
-    "batch",
-    metadata,
-    sa.Column("product_id", sa.ForeignKey("product.id", ondelete="CASCADE"), primary_key=True),
-    sa.Column("number", sa.Integer, primary_key=True, autoincrement=False),
-    sa.Column("start", sa.BigInteger, nullable=False, index=True),
-    sa.Column("stop", sa.BigInteger, nullable=False),
-    sa.Column("quality_flag", sa.Integer, nullable=False),
-    sa.Column("quality_level", sa.SmallInteger, nullable=False, index=True),
-    sa.Column("n_frames", sa.BigInteger),
-    sa.Column("r0", sa.Double, index=True),
-    sa.Column("scintillation_index", sa.Double, index=True),
-    sa.Column("scintillation_index_profile", sa.Double),
-    sa.Column("scintillation_index_point", sa.Double),
-    sa.Column("mu", sa.Double),
-    sa.Column("chi2", sa.Double),
-    sa.CheckConstraint("stop > start", name="time"),
-    sa.CheckConstraint("quality_level between 0 and 2", name="quality_level"),
-)
-
-failure = sa.Table(
-    "failure",
-    metadata,
-    sa.Column("id", sa.Integer, primary_key=True),
-    sa.Column("run_id", sa.ForeignKey("run.id"), nullable=False, index=True),
-    sa.Column("archive", sa.Text, nullable=False),
-    sa.Column("start", sa.BigInteger),
-    sa.Column("stop", sa.BigInteger),
-    sa.Column("reason", sa.Text, nullable=False),
-    sa.Column("recorded", sa.BigInteger, nullable=False),
-)
+#: alembic's own record of where the tables are.
+_alembic_version = sa.Table("alembic_version", sa.MetaData(), sa.Column("version_num", sa.String(32), primary_key=True))
 
 
 class DatabaseError(RuntimeError):
     """A database that cannot serve as a catalog."""
+
+
+class OldTables(DatabaseError):
+    """A catalog whose tables an older version made."""
+
+
+def is_catalog(root: Path) -> bool:
+    """Whether a folder has a catalog."""
+    return (root / URL_FILE).is_file() or (root / DATABASE_FILE).is_file()
+
+
+def location(root: Path) -> URL:
+    """Where the database of a catalog is.
+
+    Parameters
+    ----------
+    root : Path
+        Folder of the catalog.
+
+    Returns
+    -------
+    URL
+        What its file ``database.url`` says; its own SQLite file where there is none.
+
+    Raises
+    ------
+    DatabaseError
+        The file cannot be read, or holds no URL.
+    """
+    file = root / URL_FILE
+    try:
+        text = file.read_text(encoding="utf-8").strip()
+    except FileNotFoundError:
+        return sa.URL.create("sqlite", database=str(root / DATABASE_FILE))
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatabaseError(f"{safe(str(file))}: the file cannot be read: {error}") from error
+    return database_url(text, safe(str(file)))
+
+
+def database_url(text: str, origin: str = "the database URL") -> URL:
+    """Read the URL of a database.
+
+    Parameters
+    ----------
+    text : str
+        ``postgresql://USER@HOST/NAME`` or ``sqlite:///FILE``.
+    origin : str
+        Where it stands, for messages.
+
+    Returns
+    -------
+    URL
+        With the driver that coslidar installs.
+
+    Raises
+    ------
+    DatabaseError
+        It is no URL, or that of another kind of database.
+    """
+    try:
+        url = make_url(text)
+    except sa.exc.ArgumentError:
+        url = None
+    if url is None or url.get_backend_name() not in ("postgresql", "sqlite"):
+        # The text is not repeated: it may hold a password.
+        raise DatabaseError(f"{origin} cannot be read; write postgresql://USER@HOST/NAME or sqlite:///FILE")
+    return url.set(drivername="postgresql+psycopg") if url.drivername == "postgresql" else url
 
 
 def network_file_system(path: Path, mounts: Path = Path("/proc/self/mountinfo")) -> str | None:
@@ -187,18 +149,21 @@ class Database:
         SQLAlchemy URL, ``sqlite:///…`` or ``postgresql+psycopg://…``.
     create : bool
         Make the tables where there are none.
+    read_only : bool
+        Let the database itself refuse every change.
+    upgrade : bool
+        Bring old tables up to date instead of refusing them.
 
     Raises
     ------
+    OldTables
+        An older version made the tables, and they are not to be changed.
     DatabaseError
         The database cannot be reached, holds no catalog, or one that a newer version wrote.
     """
 
-    def __init__(self, url: str | URL, *, create: bool = True) -> None:
-        try:
-            self.url = make_url(url)
-        except sa.exc.ArgumentError as error:
-            raise DatabaseError("the database URL cannot be read; write sqlite:///FILE or postgresql://…") from error
+    def __init__(self, url: str | URL, *, create: bool = True, read_only: bool = False, upgrade: bool = False) -> None:
+        self.url = database_url(url) if isinstance(url, str) else url
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self.name = safe(self.url.render_as_string(hide_password=True))
         options: dict[str, Any] = {"connect_args": {"timeout": BUSY_TIMEOUT}} if self.is_sqlite else {}
@@ -207,10 +172,17 @@ class Database:
         except (ImportError, sa.exc.ArgumentError) as error:
             raise DatabaseError(f"{self.name}: the driver of this database cannot be loaded: {error}") from error
         if self.is_sqlite:
-            self._prepare_sqlite(create)
-        self._open(create)
+            self._prepare_sqlite(create, read_only)
+        elif read_only:
 
-    def _prepare_sqlite(self, create: bool) -> None:
+            @sa.event.listens_for(self.engine, "connect")
+            def _connect(connection: Any, _record: object) -> None:
+                connection.execute("SET SESSION CHARACTERISTICS AS TRANSACTION READ ONLY")
+                connection.commit()
+
+        self._open(create, upgrade)
+
+    def _prepare_sqlite(self, create: bool, read_only: bool) -> None:
         if not self.url.database or self.url.database == ":memory:":
             raise DatabaseError("a catalog needs a file: another process must be able to open it")
         file = Path(self.url.database)
@@ -224,6 +196,8 @@ class Database:
             connection.isolation_level = None
             for pragma in (f"busy_timeout = {int(BUSY_TIMEOUT * 1000)}", "synchronous = FULL", "foreign_keys = ON"):
                 connection.execute(f"PRAGMA {pragma}")
+            if read_only:
+                connection.execute("PRAGMA query_only = ON")
 
         @sa.event.listens_for(self.engine, "begin")
         def _begin(connection: Connection) -> None:
@@ -231,6 +205,8 @@ class Database:
             writes = connection.get_execution_options().get("coslidar_write", False)
             connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
+        if read_only:
+            return
         deadline = time.monotonic() + BUSY_TIMEOUT
         while True:
             try:
@@ -249,7 +225,7 @@ class Database:
                     ) from error
                 time.sleep(0.05)
 
-    def _open(self, create: bool) -> None:
+    def _open(self, create: bool, upgrade: bool) -> None:
         try:
             for attempt in range(3):
                 try:
@@ -259,9 +235,10 @@ class Database:
                     if version is None and create:
                         with self.write() as connection:
                             metadata.create_all(connection)
-                            self.insert_new(
-                                connection, schema_version, {"version": SCHEMA_VERSION}, schema_version.c.version
-                            )
+                            _alembic_version.create(connection, checkfirst=True)
+                            new = {"version": SCHEMA_VERSION}
+                            if self.insert_new(connection, schema_version, new, schema_version.c.version) is not None:
+                                connection.execute(_alembic_version.insert().values(version_num=str(SCHEMA_VERSION)))
                         continue
                     break
                 except (sa.exc.IntegrityError, sa.exc.ProgrammingError):
@@ -278,10 +255,32 @@ class Database:
                 f"{self.name}: a newer coslidar wrote this catalog (tables version {version}; this one knows "
                 f"{SCHEMA_VERSION}); install that version, or use another catalog"
             )
-        if version < SCHEMA_VERSION:
-            raise DatabaseError(
-                f"{self.name}: the catalog has tables of version {version}, this coslidar works with {SCHEMA_VERSION}"
+        if version < SCHEMA_VERSION and upgrade:
+            self._upgrade()
+        elif version < SCHEMA_VERSION:
+            raise OldTables(
+                f"{self.name}: the catalog has tables of version {version}, this coslidar works with "
+                f"{SCHEMA_VERSION}; 'coslidar catalog upgrade' brings them up to date"
             )
+
+    def _upgrade(self) -> None:
+        """Run the migrations that these tables lack, in one transaction: wholly, or not at all."""
+        from alembic import command
+        from alembic.config import Config
+
+        try:
+            with self.write() as connection:
+                # Publishers hold this row, and so does another upgrade; what was true before may not be any more.
+                version = connection.scalar(sa.select(schema_version.c.version).with_for_update())
+                config = Config(attributes={"connection": connection})
+                config.set_main_option("script_location", "coslidar.catalog:migrations")
+                if not sa.inspect(connection).has_table(_alembic_version.name):
+                    # Version 1 was made without alembic.
+                    command.stamp(config, str(version))
+                command.upgrade(config, str(SCHEMA_VERSION))
+        except sa.exc.SQLAlchemyError as error:
+            reason = safe(str(getattr(error, "orig", None) or error))
+            raise DatabaseError(f"{self.name}: the tables could not be brought up to date: {reason}") from error
 
     @contextmanager
     def read(self) -> Iterator[Connection]:

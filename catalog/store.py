@@ -25,27 +25,16 @@ import sqlalchemy as sa
 from ..pipeline.lineage import Key, checkout
 from ..pipeline.units import safe
 from . import provenance as records
-from .database import (
-    Database,
-    archive,
-    batch,
-    campaign,
-    failure,
-    lineage,
-    number,
-    plain_text,
-    product,
-    run,
-    schema_version,
-)
+from .database import Database, location, number, plain_text
+from .heartbeats import alive
 from .products import ProductError, check_digest, check_name, open_product, product_bytes, sync_folder, write_temporary
 from .scratch import Scratch
+from .tables import archive, batch, campaign, failure, lineage, plugin, product, run, schema_version
 
 if TYPE_CHECKING:
     from sqlalchemy.engine import Connection
     from xarray import Dataset
 
-DATABASE_FILE = "catalog.sqlite"
 _SUFFIX = ".zarr.zip"
 State = Literal["finished", "failed", "cancelled"]
 
@@ -128,11 +117,13 @@ class RunRow:
     finished: int | None
     state: str
     host: str
-    process: int
+    pid: int
     command: str
     commit: str
     software: dict[str, str]
     configuration: dict[str, Any]
+    heartbeat: int | None
+    progress: dict[str, Any] | None
 
 
 @dataclass(frozen=True)
@@ -175,6 +166,8 @@ class Catalog:
         SQLAlchemy URL; the SQLite file ``catalog.sqlite`` in `root` where it is absent.
     create : bool
         Make folder and tables where there are none.
+    read_only : bool
+        Let the database refuse every change; makes nothing.
 
     Raises
     ------
@@ -184,24 +177,33 @@ class Catalog:
         The database cannot be used.
     """
 
-    def __init__(self, root: str | os.PathLike[str], database: str | None = None, *, create: bool = True) -> None:
+    def __init__(
+        self,
+        root: str | os.PathLike[str],
+        database: str | None = None,
+        *,
+        create: bool = True,
+        read_only: bool = False,
+    ) -> None:
         self.root = Path(root).absolute()
+        create = create and not read_only
         if not create and not self.root.is_dir():
             raise CatalogError(f"{safe(str(self.root))}: there is no catalog; 'coslidar run' makes one")
         try:
             (self.root / "products").mkdir(parents=True, exist_ok=True) if create else None
         except OSError as error:
             raise CatalogError(f"{safe(str(self.root))}: the folder cannot be made: {error.strerror}") from error
-        url = database if database is not None else sa.URL.create("sqlite", database=str(self.root / DATABASE_FILE))
+        url = location(self.root) if database is None else database
         self._database = database
-        self.database = Database(url, create=create)
+        self._read_only = read_only
+        self.database = Database(url, create=create, read_only=read_only)
         self.scratch = Scratch(self.root / "scratch")
 
-    def __getstate__(self) -> tuple[Path, str | None]:
-        return self.root, self._database
+    def __getstate__(self) -> tuple[Path, str | None, bool]:
+        return self.root, self._database, self._read_only
 
-    def __setstate__(self, state: tuple[Path, str | None]) -> None:
-        self.__init__(*state)  # type: ignore[misc]
+    def __setstate__(self, state: tuple[Path, str | None, bool]) -> None:
+        self.__init__(*state[:2], read_only=state[2])  # type: ignore[misc]
 
     def __enter__(self) -> Catalog:
         return self
@@ -222,6 +224,7 @@ class Catalog:
         *,
         url: str = "",
         header: Mapping[str, Any] | None = None,
+        replace: bool = False,
     ) -> Publication:
         """Make a product part of the catalog.
 
@@ -238,6 +241,9 @@ class Catalog:
             Where the archive was.
         header : mapping, optional
             Header of the archive, JSON-able.
+        replace : bool
+            Put the product in the place of one that is there and differs, file and rows, as after a batch of it that
+            had failed was computed again.
 
         Returns
         -------
@@ -257,7 +263,7 @@ class Catalog:
         relative = f"products/{names['campaign']}/{names['archive']}.{key[:16]}{_SUFFIX}"
         target = self._file(relative)
         there = self._find_one(identity, key)
-        if there is not None and there.path.is_file():
+        if there is not None and there.path.is_file() and not (replace and there.sha256 != _sha256(data)):
             return Publication(there, False)
 
         fresh = not target.parent.is_dir()
@@ -265,7 +271,7 @@ class Catalog:
         if fresh:
             sync_folder(target.parent.parent)
         bounds = dataset["time_bounds"].values.astype(np.int64)
-        file = {"sha256": hashlib.sha256(data).hexdigest(), "size": len(data), "published": time_ns()}
+        file = {"sha256": _sha256(data), "size": len(data), "published": time_ns()}
         temporary = write_temporary(data, target.parent)
         try:
             with self.database.write() as connection:
@@ -274,7 +280,9 @@ class Catalog:
                 archive_id = self._archive_id(connection, names["campaign"], names["archive"], identity, url, header)
                 document = json.loads(dataset.attrs["lineage"])
                 row = {"key": key, "stage": plain_text(document["nodes"][key]["stage"], 100), "document": document}
-                self.database.insert_new(connection, lineage, row, lineage.c.key)
+                unknown = self.database.insert_new(connection, lineage, row, lineage.c.key) is not None
+                if unknown and (plugins := _plugin_rows(document)):
+                    connection.execute(sa.insert(plugin), plugins)
                 new = self.database.insert_new(
                     connection,
                     product,
@@ -294,13 +302,16 @@ class Catalog:
                     connection.execute(sa.insert(batch), _batch_rows(dataset, new))
                 else:
                     self._same_product(connection, archive_id, key, relative)
-                    if target.is_file():
+                    if target.is_file() and not replace:
                         # Somebody else was faster.
                         temporary.unlink()
                         return Publication(self._row(connection, archive_id, key), False)
-                    # The row outlived its file, which somebody deleted: the product is made again.
+                    # Made again: the row outlived its file, which somebody deleted, or a failed batch was tried again.
                     mine = (product.c.archive_id == archive_id) & (product.c.lineage_key == key)
+                    number_of_it = connection.scalar(sa.select(product.c.id).where(mine))
                     connection.execute(sa.update(product).where(mine).values(run_id=run_id, **file))
+                    connection.execute(sa.delete(batch).where(batch.c.product_id == number_of_it))
+                    connection.execute(sa.insert(batch), _batch_rows(dataset, number_of_it))
                 os.replace(temporary, target)
                 sync_folder(target.parent)
                 found = self._row(connection, archive_id, key)
@@ -324,7 +335,11 @@ class Catalog:
         header: Mapping[str, Any] | None,
     ) -> int:
         self.database.insert_new(connection, campaign, {"name": campaign_name}, campaign.c.id)
-        campaign_id = connection.scalar(sa.select(campaign.c.id).where(campaign.c.name == campaign_name))
+        here = sa.select(campaign.c.id, campaign.c.timezone).where(campaign.c.name == campaign_name)
+        campaign_id, zone = connection.execute(here).one()
+        given = _timezone(header)
+        if given is not None and given != zone:
+            connection.execute(sa.update(campaign).where(campaign.c.id == campaign_id).values(timezone=given))
         values = {
             "campaign_id": campaign_id,
             "name": name,
@@ -333,8 +348,8 @@ class Catalog:
             "header": dict(header or {}),
         }
         self.database.insert_new(connection, archive, values, archive.c.id)
-        here = sa.select(archive.c.id, archive.c.campaign_id, archive.c.name).where(archive.c.identity == identity)
-        row = connection.execute(here).one()
+        known = sa.select(archive.c.id, archive.c.campaign_id, archive.c.name).where(archive.c.identity == identity)
+        row = connection.execute(known).one()
         if (row.campaign_id, row.name) != (campaign_id, name):
             raise CatalogError(
                 f"{campaign_name}/{name}: the catalog knows the same recording under another name, {row.name}"
@@ -515,16 +530,17 @@ class Catalog:
         str
             Identity of the run.
         """
-        identity, host = uuid.uuid4().hex, socket.gethostname()
+        identity, host, now = uuid.uuid4().hex, socket.gethostname(), time_ns()
         with self.database.write() as connection:
             running = sa.select(run.c.id, run.c.process).where(run.c.state == "running", run.c.host == host)
-            gone = [row.id for row in connection.execute(running) if not _alive(row.process)]
+            gone = [row.id for row in connection.execute(running) if not alive(row.process)]
             if gone:
                 connection.execute(sa.update(run).where(run.c.id.in_(gone)).values(state="interrupted"))
             connection.execute(
                 sa.insert(run).values(
                     id=identity,
-                    started=time_ns(),
+                    started=now,
+                    heartbeat=now,
                     state="running",
                     host=host,
                     process=os.getpid(),
@@ -535,6 +551,22 @@ class Catalog:
                 )
             )
         return identity
+
+    def beat(self, run_id: str, progress: Mapping[str, Any] | None = None) -> None:
+        """Note that a run is alive; see :attr:`RunRow.heartbeat`.
+
+        Parameters
+        ----------
+        run_id : str
+            From :meth:`start_run`.
+        progress : mapping, optional
+            How far it is, JSON-able; see :mod:`coslidar.catalog.heartbeats`.
+        """
+        values: dict[str, Any] = {"heartbeat": time_ns()}
+        if progress is not None:
+            values["progress"] = dict(progress)
+        with self.database.write() as connection:
+            connection.execute(sa.update(run).where(run.c.id == run_id).values(**values))
 
     def finish_run(self, run_id: str, state: State = "finished") -> None:
         """Note that a run ended."""
@@ -571,7 +603,7 @@ class Catalog:
     def runs(self) -> list[RunRow]:
         """All runs, the first one first."""
         with self.database.read() as connection:
-            rows = connection.execute(sa.select(run).order_by(run.c.started)).mappings()
+            rows = connection.execute(sa.select(*_RUN).order_by(run.c.started)).mappings()
             return [RunRow(**row) for row in rows]
 
     def failures(self, run_id: str | None = None) -> list[FailureRow]:
@@ -683,6 +715,8 @@ class Catalog:
         return self._product(connection.execute(query).one())
 
 
+_RUN = [run.c.process.label("pid") if column.name == "process" else column for column in run.c]
+
 _PRODUCTS = sa.select(
     product.c.id,
     campaign.c.name.label("campaign"),
@@ -698,6 +732,28 @@ _PRODUCTS = sa.select(
     product.c.batches,
     product.c.run_id.label("run"),
 ).select_from(product.join(archive).join(campaign))
+
+
+def _timezone(header: Mapping[str, Any] | None) -> str | None:
+    site = (header or {}).get("site")
+    zone = site.get("timezone") if isinstance(site, Mapping) else None
+    return zone if isinstance(zone, str) and len(zone) <= 64 else None
+
+
+def _plugin_rows(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    return [
+        {
+            "lineage_key": document["key"],
+            "role": plain_text(role, 20),
+            "number": number,
+            "name": plain_text(identity["name"], 100),
+            "version": identity["version"],
+            "parameters": identity.get("parameters", {}),
+        }
+        for node in document["nodes"].values()
+        for role, given in node["plugins"].items()
+        for number, identity in enumerate(given if isinstance(given, list) else [given])
+    ]
 
 
 def _batch_rows(dataset: Dataset, product_id: int) -> list[dict[str, Any]]:
@@ -736,16 +792,8 @@ def _batch_rows(dataset: Dataset, product_id: int) -> list[dict[str, Any]]:
     ]
 
 
-def _alive(process: int) -> bool:
-    if process <= 0:
-        return False
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return True
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def _left_behind(path: Path, older_than: float) -> bool:
@@ -755,14 +803,16 @@ def _left_behind(path: Path, older_than: float) -> bool:
         return False
     here = re.sub(r"[^A-Za-z0-9]", "-", socket.gethostname())[:60]
     # Containers may share a name and not their processes, so even a process that is gone gets a minute.
-    gone = match[1] == here and not _alive(int(match[2]))
+    gone = match[1] == here and not alive(int(match[2]))
     try:
         return time() - path.stat().st_mtime >= (min(older_than, 60.0) if gone else older_than)
     except FileNotFoundError:
         return False
 
 
-def open_catalog(root: str | os.PathLike[str], database: str | None = None, *, create: bool = False) -> Catalog:
+def open_catalog(
+    root: str | os.PathLike[str], database: str | None = None, *, create: bool = False, read_only: bool = False
+) -> Catalog:
     """Open a catalog.
 
     Parameters
@@ -773,6 +823,8 @@ def open_catalog(root: str | os.PathLike[str], database: str | None = None, *, c
         SQLAlchemy URL of its database; the SQLite file in `root` where it is absent.
     create : bool
         Make it where there is none.
+    read_only : bool
+        Let the database refuse every change.
 
     Returns
     -------
@@ -783,7 +835,7 @@ def open_catalog(root: str | os.PathLike[str], database: str | None = None, *, c
     CatalogError, coslidar.catalog.database.DatabaseError
         There is no catalog, or it cannot be used.
     """
-    return Catalog(root, database, create=create)
+    return Catalog(root, database, create=create, read_only=read_only)
 
 
 __all__ = [

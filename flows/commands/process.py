@@ -71,7 +71,7 @@ def plan(
 ) -> None:
     """Show what a run would read, compute and reuse; nothing is computed and nothing written."""
     from ...catalog.archive import ArchiveError
-    from ...catalog.store import DATABASE_FILE
+    from ...catalog.database import is_catalog
     from ...pipeline.units import safe
     from ..cli import complain
     from ..driver import kept_correlations
@@ -83,7 +83,7 @@ def plan(
     settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
     faults: list[str] = []
     frames = computed = 0
-    catalog = existing(settings.output) if (settings.output / DATABASE_FILE).exists() else None
+    catalog = existing(settings.output) if is_catalog(settings.output) else None
     kept = kept_correlations(settings.output.absolute())
     for url in settings.archives:
         try:

@@ -19,17 +19,17 @@ _OUT = click.option(
 )
 
 
-def existing(folder: Path) -> Catalog:
+def existing(folder: Path, *, read_only: bool = False) -> Catalog:
     """The catalog in a folder; never makes one."""
-    from ...catalog.database import DatabaseError
-    from ...catalog.store import DATABASE_FILE, Catalog, CatalogError
+    from ...catalog.database import DatabaseError, is_catalog
+    from ...catalog.store import Catalog, CatalogError
     from ...pipeline.units import safe
     from ..settings import InputError
 
-    if not (folder / DATABASE_FILE).exists():
+    if not is_catalog(folder):
         raise InputError([f"{safe(str(folder))}: there is no catalog; 'coslidar run' makes one, --out names another"])
     try:
-        return Catalog(folder, create=False)
+        return Catalog(folder, create=False, read_only=read_only)
     except (CatalogError, DatabaseError) as error:
         raise InputError([str(error)]) from error
 

@@ -23,7 +23,7 @@ from made_products import IDENTITY, LENGTH, START, batch, failed, key, product
 from sqlalchemy.dialects import postgresql
 from sqlalchemy.schema import CreateIndex, CreateTable
 
-from coslidar.catalog import database, open_catalog, store
+from coslidar.catalog import database, open_catalog, store, tables
 from coslidar.catalog.database import Database, DatabaseError, network_file_system
 from coslidar.catalog.products import ProductError, temporary_name
 from coslidar.catalog.store import Catalog, CatalogError
@@ -47,7 +47,7 @@ def whole(catalog):
     assert catalog.verify() == []
     assert len({(row.archive_identity, row.lineage_key) for row in rows}) == len(rows)
     assert len({row.path for row in rows}) == len(rows)
-    counted = sa.select(database.batch.c.product_id, sa.func.count()).group_by(database.batch.c.product_id)
+    counted = sa.select(tables.batch.c.product_id, sa.func.count()).group_by(tables.batch.c.product_id)
     with catalog.database.read() as connection:
         per_product = dict(map(tuple, connection.execute(counted)))
     assert per_product == {row.id: row.batches for row in rows}
@@ -186,7 +186,7 @@ def test_a_run_whose_process_is_gone_was_interrupted(catalog):
     gone.wait()
     first, mine = catalog.start_run(), catalog.start_run()
     with catalog.database.write() as connection:
-        connection.execute(sa.update(database.run).where(database.run.c.id == first).values(process=gone.pid))
+        connection.execute(sa.update(tables.run).where(tables.run.c.id == first).values(process=gone.pid))
     catalog.start_run()
     states = {row.id: row.state for row in catalog.runs()}
     assert states[first] == "interrupted"
@@ -511,7 +511,7 @@ def test_network_file_systems_are_known(tmp_path):
 
 def test_newer_catalog_is_refused(catalog):
     with catalog.database.write() as connection:
-        connection.execute(sa.update(database.schema_version).values(version=database.SCHEMA_VERSION + 1))
+        connection.execute(sa.update(tables.schema_version).values(version=tables.SCHEMA_VERSION + 1))
     with pytest.raises(DatabaseError, match="a newer coslidar wrote this catalog"):
         Catalog(catalog.root)
 
@@ -567,31 +567,31 @@ def test_many_processes_make_one_catalog(tmp_path):
 def test_constraints_hold(catalog):
     row = catalog.publish(product()).row
     bad = [
-        sa.insert(database.archive).values(campaign_id=99, name="a", identity="b" * 64, url="", header={}),
-        sa.insert(database.archive).values(campaign_id=1, name="a", identity=IDENTITY, url="", header={}),
-        sa.insert(database.archive).values(campaign_id=1, name="a", identity="short", url="", header={}),
-        sa.update(database.batch).values(quality_level=3),
-        sa.update(database.batch).values(stop=0),
-        sa.update(database.product).values(lineage_key="c" * 64),
-        sa.delete(database.archive),
+        sa.insert(tables.archive).values(campaign_id=99, name="a", identity="b" * 64, url="", header={}),
+        sa.insert(tables.archive).values(campaign_id=1, name="a", identity=IDENTITY, url="", header={}),
+        sa.insert(tables.archive).values(campaign_id=1, name="a", identity="short", url="", header={}),
+        sa.update(tables.batch).values(quality_level=3),
+        sa.update(tables.batch).values(stop=0),
+        sa.update(tables.product).values(lineage_key="c" * 64),
+        sa.delete(tables.archive),
     ]
     for statement in bad:
         with pytest.raises(sa.exc.IntegrityError), catalog.database.write() as connection:
             connection.execute(statement)
     with catalog.database.write() as connection:
-        connection.execute(sa.delete(database.product).where(database.product.c.id == row.id))
-        assert connection.scalar(sa.select(sa.func.count()).select_from(database.batch)) == 0
+        connection.execute(sa.delete(tables.product).where(tables.product.c.id == row.id))
+        assert connection.scalar(sa.select(sa.func.count()).select_from(tables.batch)) == 0
 
 
 def test_the_tables_are_postgresql_too():
     dialect = postgresql.dialect()
     written = "\n".join(
-        [str(CreateTable(table).compile(dialect=dialect)) for table in database.metadata.sorted_tables]
-        + [str(CreateIndex(i).compile(dialect=dialect)) for t in database.metadata.sorted_tables for i in t.indexes]
+        [str(CreateTable(table).compile(dialect=dialect)) for table in tables.metadata.sorted_tables]
+        + [str(CreateIndex(i).compile(dialect=dialect)) for t in tables.metadata.sorted_tables for i in t.indexes]
     )
     assert "BIGINT" in written
     assert "DOUBLE PRECISION" in written
-    lock = sa.select(database.schema_version.c.version).with_for_update(read=True)
+    lock = sa.select(tables.schema_version.c.version).with_for_update(read=True)
     assert str(lock.compile(dialect=dialect)).endswith("FOR SHARE")
 
 
@@ -619,9 +619,9 @@ def test_postgresql(tmp_path):
             assert catalog.publish(made, run).new
             whole(catalog)
             with catalog.database.write() as connection:
-                connection.execute(sa.update(database.schema_version).values(version=99))
+                connection.execute(sa.update(tables.schema_version).values(version=99))
             with pytest.raises(DatabaseError, match="newer"):
                 Catalog(tmp_path, url)
     finally:
-        database.metadata.drop_all(engine)
+        tables.metadata.drop_all(engine)
         engine.dispose()
