@@ -10,12 +10,13 @@ from glob import glob
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 
 from ..pipeline.parameters import Configuration, Header, Name, Parameters, overlay
 from ..pipeline.units import faults as sentences
 from ..pipeline.units import safe, text
 from ..plugins.registry import KEYS, PluginError, create, get
+from .run_parameters import RunParameters
 
 M = TypeVar("M", bound=Parameters)
 
@@ -60,6 +61,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "selector": {"name": "gcv", "log_mu_min": 25.0, "log_mu_max": 33.0, "log_mu_step": 0.5},
     }
 }
+#: What `keep` of a campaign file may name.
+KEPT = ("measurements",)
 #: Tables of a campaign file that replace or complete keys of the archives' headers.
 HEADER_TABLES = ("site", "instrument", "path", "sources")
 _URL = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+://")
@@ -87,17 +90,6 @@ class Unavailable(RuntimeError):
     """Something that a run needs does not answer: a scheduler, a server. The program says so and exits with 1."""
 
 
-class RunParameters(Parameters):
-    """Where a campaign is computed; never part of a key."""
-
-    scheduler: str | None = Field(default=None, max_length=1000)
-    """Address (`tcp://…`, `tls://…`) or scheduler file of a Dask cluster; this machine where it is absent."""
-    threads: int | None = Field(default=None, ge=1, le=1024)
-    """Threads on this machine; one per core where it is absent."""
-    archives_at_once: int = Field(default=2, ge=1, le=256)
-    """Archives in flight, so that no worker idles while one archive is being finished."""
-
-
 @dataclass(frozen=True)
 class Settings:
     """What to compute, and where.
@@ -120,6 +112,8 @@ class Settings:
         Tables that replace or complete the archives' headers.
     run : RunParameters
         Where to compute.
+    keep : tuple of str
+        Intermediate results that are kept beside the correlations: ``measurements``. No key depends on it.
     """
 
     origin: str
@@ -130,6 +124,12 @@ class Settings:
     plugins: dict[str, dict[str, Any]] = field(default_factory=lambda: dict(DEFAULT_PLUGINS))
     header: dict[str, Any] = field(default_factory=dict)
     run: RunParameters = field(default_factory=RunParameters)
+    keep: tuple[str, ...] = ()
+
+    @property
+    def keeps_measurements(self) -> bool:
+        """Whether slopes and fluxes of every batch are kept, so that other correlations of them read no frame."""
+        return "measurements" in self.keep
 
     def effective_header(self, attributes: Mapping[str, Any], origin: str) -> Header:
         """Header of an archive with this campaign's tables on top.
@@ -321,6 +321,10 @@ def load(
     if not isinstance(patterns, list) or not all(isinstance(item, str) for item in patterns):
         faults.append(f"{origin}: archives must be a list of paths, patterns or URLs, for example ['raw/*.zarr.zip']")
         patterns = []
+    keep = table.pop("keep", [])
+    if not isinstance(keep, list) or not all(item in KEPT for item in keep):
+        faults.append(f"{origin}: keep = {keep!r}: it must be a list of what can be kept: {', '.join(KEPT)}")
+        keep = []
     out = table.pop("output", "results")
     if not isinstance(out, str):
         faults.append(f"{origin}: output = {out!r}: it must be the path of a folder")
@@ -338,6 +342,13 @@ def load(
     except ValidationError as error:
         faults += sentences(error, origin, "run")
         run = RunParameters()
+    if run.tls is not None:
+        run = run.model_copy(update={"tls": run.tls.below(folder)})
+        faults += run.tls.faults(origin) if run.tls is not None else []
+    if scheduler is not None:
+        run = run.model_copy(update={"scheduler": scheduler, "jobs": None})
+    if run.scheduler is not None and run.jobs is not None:
+        faults.append(f"{origin}: run.scheduler and run.jobs: a run has one cluster; leave one of them out")
     try:
         configuration = Configuration.model_validate(table)
     except ValidationError as error:
@@ -350,8 +361,6 @@ def load(
         expanded = _expand(patterns, folder, origin, faults)
     if faults:
         raise InputError(faults)
-    if scheduler is not None:
-        run = replace_run(run, scheduler)
     return Settings(
         origin=origin,
         campaign=name,
@@ -361,6 +370,7 @@ def load(
         plugins=plugins,
         header=header,
         run=run,
+        keep=tuple(keep),
     )
 
 
@@ -382,11 +392,6 @@ def _with_preset(table: dict[str, Any], origin: str, faults: list[str]) -> dict[
             # Parameters of one plugin mean nothing to another.
             del below[key]
     return overlay(below, table)
-
-
-def replace_run(run: RunParameters, scheduler: str) -> RunParameters:
-    """The same run on another scheduler."""
-    return run.model_copy(update={"scheduler": scheduler})
 
 
 def sentences_of(model: type[M], values: dict[str, Any], origin: str) -> M:
