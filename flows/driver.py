@@ -8,14 +8,11 @@ same command goes on where it was.
 from __future__ import annotations
 
 import logging
-from concurrent.futures import FIRST_COMPLETED, CancelledError, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
-from queue import Empty, SimpleQueue
 from threading import Event, Lock
 from typing import TYPE_CHECKING, Any, Protocol
-
-import numpy as np
 
 from ..catalog.archive import ArchiveError
 from ..catalog.kept import Kept
@@ -25,27 +22,24 @@ from ..pipeline import description, response
 from ..pipeline.products import QUALITY_FLAGS
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
-from .cluster import ALLOWED_FAILURES, BatchOutcome, BatchTask, as_stored, from_stored, process_batch, remember
-from .plan import ArchivePlan, BatchWindow, plan_archive
+from . import logs
+from .batches import FAILED, PATIENCE, Batches, Workers
+from .plan import ArchivePlan, plan_archive
 from .settings import InputError, Unavailable, cache_folder
+from .tasks import Origin, remember
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
-    from distributed import Client, Future
+    from distributed import Client
     from numpy.typing import NDArray
 
     from ..catalog.store import Catalog
-    from ..pipeline.products import BatchResult
+    from .pulse import Pulse
     from .settings import Settings
 
 log = logging.getLogger("coslidar")
-
-#: Batches per worker thread that are under way at once: enough that none idles, few enough that memory stays flat.
-AHEAD = 2
-#: How often those who wait look whether the run is to stop, s.
-PATIENCE = 0.2
 
 
 class Stopped(BaseException):
@@ -64,6 +58,9 @@ class Progress(Protocol):
     def finished(self, outcome: ArchiveOutcome) -> None:
         """An archive is done."""
 
+    def warned(self, message: str) -> None:
+        """Something is to be known that is no failure."""
+
 
 @dataclass(frozen=True)
 class ArchiveOutcome:
@@ -76,8 +73,8 @@ class ArchiveOutcome:
     name : str
         Campaign and archive; the url where it could not be opened.
     status : str
-        ``published``, ``present`` (nothing to do), ``refused`` (its input is at fault), ``failed``, or
-        ``cancelled`` (the run was interrupted).
+        ``published``, ``present`` (nothing to do), ``skipped`` (not asked for), ``refused`` (its input is at fault),
+        ``failed``, or ``cancelled`` (the run was interrupted).
     batches, failed_batches, reused, frames_read : int
         Batches in all, those that failed, those that were there already, and frames that were read.
     faults : tuple of str
@@ -86,6 +83,8 @@ class ArchiveOutcome:
         Path of the product in the catalog.
     input_fault : bool
         Whether the fault lies in the data (exit code 2) rather than in the run.
+    note : str
+        Why it was skipped.
     """
 
     url: str
@@ -98,6 +97,32 @@ class ArchiveOutcome:
     faults: tuple[str, ...] = ()
     product: str = ""
     input_fault: bool = False
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What a run is to do beside its settings; no number depends on it.
+
+    Parameters
+    ----------
+    retry_failed : bool
+        Also compute batches again that failed in products which are there.
+    keep_going : bool
+        Begin the other archives although one has failed.
+    since, until : int or None
+        Only archives with frames at `since` or later, and before `until`; ns since 1970 UTC.
+    """
+
+    retry_failed: bool = False
+    keep_going: bool = True
+    since: int | None = None
+    until: int | None = None
+
+    def wants(self, plan: ArchivePlan) -> bool:
+        """Whether an archive lies in the range of time."""
+        first, last = int(plan.archive.time[0]), int(plan.archive.time[-1])
+        return (self.since is None or last >= self.since) and (self.until is None or first < self.until)
 
 
 @dataclass(eq=False)
@@ -114,22 +139,30 @@ class Work:
         Identity of the run in the catalog.
     client : distributed.Client
         Where batches are computed.
-    progress : Progress
+    progress : Pulse
         Who is told.
+    options : Options
+        What to do beside.
     """
 
     settings: Settings
     catalog: Catalog
     run: Any
     client: Client
-    progress: Progress
+    progress: Pulse
+    options: Options = field(default_factory=Options)
+    origin: Origin = field(default_factory=Origin.here)
     correlations: Kept = field(init=False)
     responses: Kept = field(init=False)
+    workers: Workers = field(init=False)
     stopping: Event = field(default_factory=Event)
     _matrices: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
+    _warned: set[str] = field(default_factory=set)
+
     def __post_init__(self) -> None:
+        self.workers = Workers(self.client)
         self.correlations = kept_correlations(self.catalog.root)
         # A response matrix depends on no recording, so all catalogs of a user share theirs.
         self.responses = Kept(cache_folder() / "responses")
@@ -155,8 +188,7 @@ class Work:
                     plan.grid,
                     plan.spectrum,
                     plan.sources,
-                    sampling=parameters.sampling,
-                    slope_response=parameters.slope_response,
+                    self.settings.configuration.response,
                 )
                 with suppress(OSError):  # a cache that cannot be written only costs time
                     self.responses.save(digest, {"M": found})
@@ -195,14 +227,37 @@ def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
 
 def process_archive(url: str, work: Work) -> ArchiveOutcome:
     """Process one archive; never raises for what is wrong with it."""
+    with logs.about(run=work.run, archive=safe(url)):
+        outcome = _outcome(url, work)
+        if outcome.status == "cancelled":
+            return outcome
+        if outcome.status in ("refused", "failed"):
+            work.spoiled.set()
+            for fault in outcome.faults:
+                log.error("%s", fault)
+                if not outcome.batches:  # those of its batches were recorded as they came
+                    work.catalog.record_failure(work.run, url, fault)
+        log.info(
+            "archive %s: %d of %d batches", outcome.status, outcome.batches - outcome.failed_batches, outcome.batches
+        )
+    work.progress.finished(outcome)
+    return outcome
+
+
+def _outcome(url: str, work: Work) -> ArchiveOutcome:
     name = safe(url)
     try:
         work.check()
+        if work.spoiled.is_set() and not work.options.keep_going:
+            return ArchiveOutcome(url, name, "skipped", note="not begun, because another archive failed")
         plan = plan_archive(url, work.settings)
         name = plan.name
-        outcome = _process(plan, work)
+        if not work.options.wants(plan):
+            return ArchiveOutcome(url, name, "skipped", note="outside the range of time")
+        with logs.about(archive=name):
+            return _process(plan, work)
     except (ArchiveError, InputError, PluginError) as error:
-        outcome = ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
+        return ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
     except Stopped:
         return ArchiveOutcome(url, name, "cancelled")
     except Unavailable:
@@ -212,68 +267,44 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
             raise lost(work.settings) from error
         # Whatever else goes wrong with one archive must not take the others down.
         log.debug("archive %s failed", url, exc_info=True)
-        reason = f"{name}: {type(error).__name__}: {safe(str(error))}"
-        outcome = ArchiveOutcome(url, name, "failed", faults=(reason,))
-    if outcome.status in ("refused", "failed"):
-        for fault in outcome.faults:
-            work.catalog.record_failure(work.run, url, fault)
-    work.progress.finished(outcome)
-    return outcome
+        return ArchiveOutcome(url, name, "failed", faults=(f"{name}: {type(error).__name__}: {safe(str(error))}",))
 
 
 def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     catalog, digest = work.catalog, str(plan.profile_key)
+    again = False
     if catalog.has(plan.archive.identity, digest):
         row = catalog.products(archive_identity=plan.archive.identity, lineage_key=digest)[0]
-        batches = catalog.batches(lineage_key=digest)
-        lost = sum(bool(batch.quality_flag & QUALITY_FLAGS["failed"][0]) for batch in batches)
-        # The same command says the same again, whether it is the first or the second time that it gets so far.
-        return ArchiveOutcome(
-            plan.url,
-            plan.name,
-            "present",
-            batches=row.batches,
-            failed_batches=lost,
-            product=str(row.path),
-            input_fault=lost > 0,
-        )
-    remember(plan.archive)
-    done: dict[int, BatchResult] = {}
-    for window in plan.windows:
-        if (finished := catalog.scratch.load(plan.result_key(window))) is not None:
-            done[window.index] = finished
-    reused = len(done)
-    todo = [window for window in plan.windows if window.index not in done]
-    work.progress.planned(plan.name, len(todo))
-    frames_read, transient = 0, False
-    for window, outcome in _compute(plan, todo, work):
-        frames_read += outcome.frames_read
-        if outcome.reduced is not None:
-            work.correlations.save(plan.correlation_key(window), as_stored(outcome.reduced))
-        if outcome.transient:
-            transient = True
-        elif outcome.lasting:
-            catalog.scratch.save(plan.result_key(window), outcome.result)
-        done[window.index] = outcome.result
-        if outcome.result.reason:
-            catalog.record_failure(
-                work.run, plan.url, outcome.result.reason, start=window.start_time, stop=window.stop_time
+        failed = sum(bool(batch.quality_flag & FAILED) for batch in catalog.batches(lineage_key=digest))
+        again = work.options.retry_failed and failed > 0
+        if not again:
+            # The same command says the same again, whether it is the first or the second time that it gets so far.
+            return ArchiveOutcome(
+                plan.url,
+                plan.name,
+                "present",
+                batches=row.batches,
+                failed_batches=failed,
+                product=str(row.path),
+                input_fault=failed > 0,
             )
-        work.progress.advanced(plan.name, window.index, outcome.result.reason)
-
-    results = [done[window.index] for window in plan.windows]
+    remember(plan.archive)
+    batches = Batches(plan, work)
+    work.progress.planned(plan.name, len(batches.todo))
+    log.info("%d of %d batches to compute", len(batches.todo), len(plan.windows))
+    results = batches.compute(lambda: model_of(plan, work))
     faults = tuple(
         f"{plan.name}: batch {number}: {result.reason}" for number, result in enumerate(results) if result.reason
     )
     counts: dict[str, Any] = {
         "batches": len(results),
         "failed_batches": len(faults),
-        "reused": reused,
-        "frames_read": frames_read,
+        "reused": batches.reused,
+        "frames_read": batches.frames_read,
     }
-    if len(faults) == len(results) or transient:
+    if len(faults) == len(results) or batches.transient:
         # What the machine spoiled may succeed next time; what the data forbid never will.
-        return ArchiveOutcome(plan.url, plan.name, "failed", faults=faults, input_fault=not transient, **counts)
+        return ArchiveOutcome(plan.url, plan.name, "failed", faults=faults, input_fault=not batches.transient, **counts)
     header = plan.header
     dataset = assemble(
         results,
@@ -287,7 +318,7 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
         scintillometers=[scintillometer.name for scintillometer in header.scintillometers],
         attributes=attributes_of(plan, work.settings),
     )
-    published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes)
+    published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes, replace=again)
     catalog.scratch.remove(plan.result_key(window) for window in plan.windows)
     return ArchiveOutcome(
         plan.url,
@@ -328,75 +359,6 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
     return attributes
 
 
-def _compute(plan: ArchivePlan, todo: list[BatchWindow], work: Work) -> Iterator[tuple[BatchWindow, BatchOutcome]]:
-    """Send batches to the workers, a few ahead, and yield them as they come back."""
-    if not todo:
-        return
-    settings, client = work.settings, work.client
-    # The model travels with every batch: a few kB, and no worker that dies can take the only copy along.
-    model = model_of(plan, work)
-    waiting = iter(todo)
-    flying: dict[str, tuple[Future, BatchWindow]] = {}
-    back: SimpleQueue[Future] = SimpleQueue()
-
-    def submit() -> None:
-        window = next(waiting, None)
-        if window is None:
-            return
-        stored = work.correlations.load(plan.correlation_key(window))
-        task = BatchTask(
-            url=plan.url,
-            identity=plan.archive.identity,
-            window=window,
-            header=plan.header,
-            duration=settings.configuration.batch.duration,
-            extraction=settings.configuration.extraction,
-            correlation=settings.configuration.correlation,
-            complete=settings.header,
-            reduced=from_stored(stored) if stored else None,
-        )
-        future = client.submit(process_batch, task, model, pure=False, key=f"{plan.name}-{window.index}-{id(task):x}")
-        flying[future.key] = (future, window)
-        future.add_done_callback(back.put)
-
-    try:
-        for _ in range(max(1, sum(client.nthreads().values())) * AHEAD):
-            submit()
-        while flying:
-            work.check()
-            try:
-                future = back.get(timeout=PATIENCE)
-            except Empty:
-                continue
-            _, window = flying.pop(future.key)
-            outcome = _outcome(future, window, plan)
-            future.release()
-            submit()
-            yield window, outcome
-    finally:
-        with suppress(Exception):  # the scheduler may be what is gone
-            client.cancel([future for future, _ in flying.values()])
-
-
-def _outcome(future: Future, window: BatchWindow, plan: ArchivePlan) -> BatchOutcome:
-    """What a worker sent back; a fault of the machine is one of this try only."""
-    from distributed import KilledWorker
-
-    try:
-        outcome: BatchOutcome = future.result()
-        return outcome
-    except KilledWorker:
-        reason = (
-            f"every worker that computed it died ({ALLOWED_FAILURES + 1} tries); too little memory is the usual cause"
-        )
-    except CancelledError:
-        raise  # somebody stopped the scheduler, or told it to forget
-    except Exception as error:
-        log.debug("batch %s of %s failed", window.index, plan.name, exc_info=True)
-        reason = f"{type(error).__name__}: {safe(str(error))}"
-    return BatchOutcome(window, stages.failed(window.start_time, window.stop_time, reason), None, 0, transient=True)
-
-
 def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[ArchiveOutcome]]) -> list[ArchiveOutcome]:
     """Process archives, several at once, and keep the record of the run.
 
@@ -415,7 +377,7 @@ def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[Arc
         In the order of `archives`.
     """
     outcomes = fan_out(process_archive, list(archives), work)
-    complete = all(outcome.status in ("published", "present") for outcome in outcomes)
+    complete = all(outcome.status in ("published", "present", "skipped") for outcome in outcomes)
     work.catalog.finish_run(work.run, "finished" if complete else "failed")
     return outcomes
 

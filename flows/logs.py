@@ -155,7 +155,8 @@ def collected(level: int) -> Iterator[list[dict[str, Any]]]:
     if _collector not in log.handlers:
         log.addHandler(_collector)
     log.setLevel(level)
-    token = _collected.set(records := [])
+    records: list[dict[str, Any]] = []
+    token = _collected.set(records)
     try:
         yield records
     finally:

@@ -71,8 +71,8 @@ class ArchivePlan:
         Names of the sources that are used.
     windows : tuple of BatchWindow
         Batches.
-    reduction_key, response_key, profile_key : Key
-        Identity of the correlations, of the response matrix, and of the product.
+    measured_key, reduction_key, response_key, profile_key : Key
+        Identity of slopes and fluxes, of the correlations, of the response matrix, and of the product.
     """
 
     url: str
@@ -86,6 +86,7 @@ class ArchivePlan:
     regulariser: RegulariserBase
     selector: HyperparameterSelectorBase
     windows: tuple[BatchWindow, ...]
+    measured_key: Key
     reduction_key: Key
     response_key: Key
     profile_key: Key
@@ -94,6 +95,15 @@ class ArchivePlan:
     def name(self) -> str:
         """Campaign and archive, for people."""
         return f"{self.header.campaign}/{self.header.archive}"
+
+    @property
+    def reach(self) -> int:
+        """How many batches before and after each one the selector looks at."""
+        return int(getattr(self.selector, "neighbours", 0))
+
+    def measurement_key(self, window: BatchWindow) -> Key:
+        """Identity of the slopes and fluxes of one batch."""
+        return make_key("measurement batch", 1, tracked=window.start_time, upstream=[self.measured_key])
 
     def correlation_key(self, window: BatchWindow) -> Key:
         """Identity of the correlations of one batch."""
@@ -251,6 +261,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         regulariser=regulariser,
         selector=selector,
         windows=tuple(batch_windows(archive.time, instrument.frame_rate, configuration.batch)),
+        measured_key=measured,
         reduction_key=reduction,
         response_key=responses,
         profile_key=profile,

@@ -39,6 +39,8 @@ def _sentence(outcome: ArchiveOutcome) -> str:
             words += f", {outcome.reused} computed earlier"
     elif outcome.status == "present":
         words = f"{counted(outcome.batches - outcome.failed_batches, 'batch')}, in the catalog already"
+    elif outcome.status == "skipped":
+        words = f"skipped, {outcome.note}"
     if outcome.failed_batches:
         words += f", {outcome.failed_batches} of {outcome.batches} failed"
     return words
@@ -65,6 +67,10 @@ class Lines:
         if fault not in self._told:
             self._told.add(fault)
             say(fault)
+
+    def warned(self, message: str) -> None:
+        """Say what is no failure."""
+        say(message)
 
     def finished(self, outcome: ArchiveOutcome) -> None:
         """Say what became of an archive."""

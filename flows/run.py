@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import shlex
+import sys
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
+from threadpoolctl import threadpool_limits
+
+from . import logs
 from .cluster import connect
-from .driver import ArchiveOutcome, Progress, Work, execute, in_threads
+from .driver import ArchiveOutcome, Options, Progress, Work, execute, in_threads
+from .pulse import Pulse
 from .settings import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from .settings import Settings
+
+
+log = logging.getLogger("coslidar")
 
 
 class Silent:
@@ -22,6 +33,9 @@ class Silent:
         """Nothing."""
 
     def advanced(self, archive: str, index: int, reason: str) -> None:
+        """Nothing."""
+
+    def warned(self, message: str) -> None:
         """Nothing."""
 
     def finished(self, outcome: ArchiveOutcome) -> None:
@@ -38,11 +52,13 @@ def described(settings: Settings) -> dict[str, Any]:
         "plugins": settings.plugins,
         "header": settings.header,
         "run": settings.run.model_dump(mode="json"),
+        "keep": list(settings.keep),
+        "folder": os.getcwd(),
     }
 
 
 @contextmanager
-def session(settings: Settings, progress: Progress | None = None) -> Iterator[Work]:
+def session(settings: Settings, progress: Progress | None = None, options: Options | None = None) -> Iterator[Work]:
     """Open what the archives of one run share, and close it in any case.
 
     Parameters
@@ -51,6 +67,8 @@ def session(settings: Settings, progress: Progress | None = None) -> Iterator[Wo
         What to compute, and where.
     progress : Progress, optional
         Who is told.
+    options : Options, optional
+        What to do beside the settings.
 
     Yields
     ------
@@ -70,10 +88,16 @@ def session(settings: Settings, progress: Progress | None = None) -> Iterator[Wo
         opened = Catalog(settings.output)
     except (CatalogError, DatabaseError) as error:
         raise InputError([str(error)]) from error
-    with opened as catalog, connect(settings.run) as client:
-        work = Work(settings, catalog, catalog.start_run(described(settings)), client, progress or Silent())
+    # Batches run in parallel, so numerical libraries use one thread each, also where Python was not started by us.
+    with opened as catalog, threadpool_limits(limits=1), connect(settings.run) as client:
+        identity = catalog.start_run(described(settings), shlex.join(sys.argv))
+        threads = sum(client.nthreads().values())
+        pulse = Pulse(catalog, identity, progress or Silent(), len(settings.archives), threads)
+        work = Work(settings, catalog, identity, client, pulse, options or Options())
         try:
-            yield work
+            with pulse, logs.about(run=identity):
+                log.info("%d archives on %d threads into %s", len(settings.archives), threads, settings.output)
+                yield work
         except BaseException as error:
             work.stopping.set()
             with suppress(Exception):  # the catalog may be what failed
@@ -81,7 +105,9 @@ def session(settings: Settings, progress: Progress | None = None) -> Iterator[Wo
             raise
 
 
-def run(settings: Settings, progress: Progress | None = None, *, prefect: bool = True) -> list[ArchiveOutcome]:
+def run(
+    settings: Settings, progress: Progress | None = None, *, prefect: bool = True, options: Options | None = None
+) -> list[ArchiveOutcome]:
     """Process every archive of the settings.
 
     Parameters
@@ -92,6 +118,8 @@ def run(settings: Settings, progress: Progress | None = None, *, prefect: bool =
         Who is told how far it is.
     prefect : bool
         As a Prefect flow, or as a bare loop; the results are the same bytes.
+    options : Options, optional
+        What to do beside the settings; no number depends on it.
 
     Returns
     -------
@@ -106,12 +134,12 @@ def run(settings: Settings, progress: Progress | None = None, *, prefect: bool =
         The cluster or the Prefect server cannot be used.
     """
     if not prefect:
-        with session(settings, progress) as work:
+        with session(settings, progress, options) as work:
             return execute(work, settings.archives, in_threads)
     from .server import server
 
     # The server starts while catalog and workers do.
-    with server() as ready, session(settings, progress) as work:
+    with server() as ready, session(settings, progress, options) as work:
         ready()
         from .campaign import processing_flow
 

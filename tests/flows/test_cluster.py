@@ -16,7 +16,7 @@ import pytest
 from small_runs import ARCHIVES, BATCHES, SETTINGS, Finished, environment, family, products, run_arguments, wait_for
 
 from coslidar.catalog import open_catalog
-from coslidar.flows import cluster
+from coslidar.flows import cluster, tasks
 from coslidar.flows.run import run
 from coslidar.flows.settings import RunParameters, Unavailable, load
 
@@ -177,9 +177,9 @@ def test_a_worker_that_cannot_see_the_archive_is_no_fault_of_the_data(
 def _blind(folder: Path) -> Path:
     path = folder / "blind.py"
     path.write_text(
-        "from coslidar.flows import cluster\n"
+        "from coslidar.flows import tasks\n"
         "from coslidar.catalog.archive import open_archive\n"
-        "cluster.open_archive = lambda url, **options: open_archive(url + '.elsewhere', **options)\n"
+        "tasks.open_archive = lambda url, **options: open_archive(url + '.elsewhere', **options)\n"
     )
     return path
 
@@ -245,7 +245,7 @@ class FakeClient:
 
 
 def test_versions_are_compared_and_both_named() -> None:
-    mine = cluster._versions()
+    mine = tasks.versions()
     cluster.check_workers(FakeClient({"tcp://a:1": {}, "tcp://b:1": {}}), "tcp://x")  # type: ignore[arg-type]
     with pytest.raises(Unavailable) as error:
         cluster.check_workers(
@@ -285,7 +285,7 @@ def test_what_goes_wrong_on_a_worker_does_not_travel(
 
     settings = load(archives=recordings[:1], output=tmp_path, assignments=SETTINGS)
     with monkeypatch.context() as patch:
-        patch.setattr(cluster.stages, "retrieve", fail)
+        patch.setattr(tasks.stages, "retrieve", fail)
         (outcome,) = run(settings, prefect=False)
     assert (outcome.status, outcome.input_fault) == ("failed", False)
     assert all("Unpicklable: boom" in fault for fault in outcome.faults)
