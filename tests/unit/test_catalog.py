@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sqlalchemy as sa
+from catalogs import KINDS, database_of
 from made_products import IDENTITY, LENGTH, START, batch, failed, key, product
 from sqlalchemy.dialects import postgresql
 from sqlalchemy.schema import CreateIndex, CreateTable
@@ -31,8 +32,15 @@ from coslidar.catalog.store import Catalog, CatalogError
 HELPERS = str(Path(__file__).parents[1])
 
 
+@pytest.fixture(params=KINDS)
+def catalog(request, tmp_path):
+    sqlite = request.param == "sqlite"
+    with database_of(request.param, tmp_path) as url, Catalog(tmp_path / "catalog", None if sqlite else url) as made:
+        yield made
+
+
 @pytest.fixture
-def catalog(tmp_path):
+def on_sqlite(tmp_path):
     with Catalog(tmp_path / "catalog") as made:
         yield made
 
@@ -307,15 +315,15 @@ def test_hostile_texts_are_stored_as_texts(catalog):
     assert len(found.reason) < 10_100
 
 
-def test_a_path_in_a_forged_database_stays_inside(catalog):
-    row = catalog.publish(product()).row
-    catalog.close()
+def test_a_path_in_a_forged_database_stays_inside(on_sqlite):
+    row = on_sqlite.publish(product()).row
+    on_sqlite.close()
     for path in ("../../etc/passwd", "products/../x", "/etc/passwd", "products/c/../../../x.0123456789abcdef.zarr.zip"):
-        with sqlite3.connect(catalog.root / "catalog.sqlite") as connection:
+        with sqlite3.connect(on_sqlite.root / "catalog.sqlite") as connection:
             connection.execute("UPDATE product SET path = ? WHERE id = ?", (path, row.id))
         connection.close()
         with pytest.raises((CatalogError, ProductError)):
-            catalog.products()
+            on_sqlite.products()
 
 
 def test_one_recording_under_two_names_is_refused(catalog):
@@ -462,8 +470,8 @@ def test_killed_publishers_for_long(tmp_path):
 # --- database ----------------------------------------------------------------------------------------------
 
 
-def test_sqlite_settings(catalog):
-    with catalog.database.read() as connection:
+def test_sqlite_settings(on_sqlite):
+    with on_sqlite.database.read() as connection:
         settings = {
             name: connection.exec_driver_sql(f"PRAGMA {name}").scalar()
             for name in ("journal_mode", "synchronous", "foreign_keys", "busy_timeout")
@@ -509,11 +517,11 @@ def test_network_file_systems_are_known(tmp_path):
     assert network_file_system(Path("/"), tmp_path / "nowhere") is None
 
 
-def test_newer_catalog_is_refused(catalog):
-    with catalog.database.write() as connection:
+def test_newer_catalog_is_refused(on_sqlite):
+    with on_sqlite.database.write() as connection:
         connection.execute(sa.update(tables.schema_version).values(version=tables.SCHEMA_VERSION + 1))
     with pytest.raises(DatabaseError, match="a newer coslidar wrote this catalog"):
-        Catalog(catalog.root)
+        Catalog(on_sqlite.root)
 
 
 @pytest.mark.parametrize("content", [b"no database at all, but more than sixteen bytes", b"SQLite format 3\0 damaged"])
@@ -593,35 +601,3 @@ def test_the_tables_are_postgresql_too():
     assert "DOUBLE PRECISION" in written
     lock = sa.select(tables.schema_version.c.version).with_for_update(read=True)
     assert str(lock.compile(dialect=dialect)).endswith("FOR SHARE")
-
-
-@pytest.mark.skipif("COSLIDAR_TEST_POSTGRESQL" not in os.environ, reason="COSLIDAR_TEST_POSTGRESQL names no server")
-def test_postgresql(tmp_path):
-    url = os.environ["COSLIDAR_TEST_POSTGRESQL"]
-    engine = sa.create_engine(url)
-    with engine.connect() as connection:
-        assert sa.inspect(connection).get_table_names() == [], "this test wants an empty database: it drops its tables"
-    try:
-        with Catalog(tmp_path, url) as catalog:
-            run = catalog.start_run({"note": "\0"}, "x\0\ud800")
-            made = product()
-            with ThreadPoolExecutor(8) as pool:
-                outcomes = list(pool.map(lambda _: catalog.publish(made, run), range(16)))
-            assert sum(outcome.new for outcome in outcomes) == 1
-            assert len({outcome.row for outcome in outcomes}) == 1
-            assert catalog.has(IDENTITY, key())
-            assert catalog.find("2012-09-14T1415") == outcomes[0].row
-            assert catalog.collect(older_than=0) == []
-            assert [row.r0 is None for row in catalog.batches()] == [False, False, True]
-            catalog.record_failure(run, "x", "no light", start=START, stop=START + LENGTH)
-            catalog.finish_run(run)
-            outcomes[0].row.path.unlink()
-            assert catalog.publish(made, run).new
-            whole(catalog)
-            with catalog.database.write() as connection:
-                connection.execute(sa.update(tables.schema_version).values(version=99))
-            with pytest.raises(DatabaseError, match="newer"):
-                Catalog(tmp_path, url)
-    finally:
-        tables.metadata.drop_all(engine)
-        engine.dispose()
