@@ -8,28 +8,21 @@ import os
 import re
 import socket
 import warnings
-from collections import OrderedDict
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..pipeline.units import safe
-from .settings import InputError, Unavailable
+from .jobs import submitted, tls_security
+from .settings import InputError, Unavailable, cache_folder
+from .tasks import differences, versions
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from distributed import Client
 
-    from ..catalog.archive import Archive
-    from ..pipeline.batch import Model, ReducedBatch
-    from ..pipeline.parameters import CorrelationParameters, ExtractionParameters, Header
-    from ..pipeline.products import BatchResult
-    from .plan import BatchWindow
-    from .settings import RunParameters
-
-log = logging.getLogger("coslidar")
+    from .run_parameters import RunParameters
 
 #: A batch that has been lost with its worker more often than this is taken for poison.
 ALLOWED_FAILURES = 3
@@ -130,8 +123,8 @@ def connect(run: RunParameters) -> Iterator[Client]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
     threads = run.threads or _cores()
-    with dask.config.set(_settings()):
-        if run.scheduler is None:
+    with ExitStack() as made, dask.config.set(_settings()):
+        if run.scheduler is None and run.jobs is None:
             client = Client(
                 processes=False,
                 n_workers=1,
@@ -142,30 +135,42 @@ def connect(run: RunParameters) -> Iterator[Client]:
                 worker_dashboard_address="127.0.0.1:0",
             )
         else:
-            address = scheduler_address(run.scheduler)
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", VersionMismatchWarning)  # we refuse, and say more
-                    client = Client(address, timeout=PATIENCE, set_as_default=False)
-            except (OSError, ValueError, TimeoutError) as error:
-                raise _no_scheduler(address, error) from error
+            client = _elsewhere(run, made)
         try:
             if run.scheduler is not None:
-                check_workers(client, run.scheduler)
+                check_workers(client, f"the Dask scheduler at {run.scheduler}")
+            elif run.jobs is not None:
+                check_workers(client, f"the cluster of {run.jobs.system} jobs", run.jobs.patience)
             yield client
         finally:
             client.close()
 
 
-def _versions() -> dict[str, str]:
-    import platform
-    from importlib.metadata import version
+def _elsewhere(run: RunParameters, made: ExitStack) -> Client:
+    """Client of a cluster that is not in this process; `made` ends what was started for it."""
+    from distributed import Client
+    from distributed.versions import VersionMismatchWarning
 
-    names = ("coslidar", "numpy", "scipy", "numba", "zarr", "numcodecs", "dask", "distributed")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", VersionMismatchWarning)  # we refuse, and say more
+        if run.jobs is not None:
+            return Client(made.enter_context(submitted(run.jobs, cache_folder() / "jobs")), set_as_default=False)
+        address = scheduler_address(str(run.scheduler))
+        if address.startswith("tls://") and run.tls is None:
+            raise InputError(
+                [
+                    f"run.scheduler = {run.scheduler!r}: a tls:// scheduler needs certificates; add a table [run.tls] "
+                    "with ca_file, certificate and key to the campaign file"
+                ]
+            )
+        security = None if run.tls is None else tls_security(run.tls)
+        try:
+            return Client(address, timeout=PATIENCE, set_as_default=False, security=security)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise _no_scheduler(address, error) from error
 
 
-def check_workers(client: Client, address: str) -> None:
+def check_workers(client: Client, address: str, patience: float = PATIENCE) -> None:
     """Refuse a cluster without workers, or with other packages than ours: numbers would depend on where a batch ran.
 
     Parameters
@@ -174,6 +179,8 @@ def check_workers(client: Client, address: str) -> None:
         Connected to a cluster of somebody else.
     address : str
         What the user calls it.
+    patience : float
+        How long the first worker may take, s.
 
     Raises
     ------
@@ -181,12 +188,12 @@ def check_workers(client: Client, address: str) -> None:
         No worker comes, or its versions differ.
     """
     try:
-        client.wait_for_workers(1, timeout=PATIENCE)
+        client.wait_for_workers(1, timeout=patience)
     except TimeoutError as error:
-        raise Unavailable(
-            f"the Dask scheduler at {address} has no worker; start some with 'dask worker {client.scheduler.address}'"
-        ) from error
-    mine = _versions()
+        remedy = f"start some with 'dask worker {client.scheduler.address}'"
+        if client.cluster is not None:
+            remedy = f"none started within {patience:g} s (run.jobs.patience); their output says why"
+        raise Unavailable(f"{address} has no worker; {remedy}") from error
     try:
         theirs = client.run(versions)
     except Exception as error:
