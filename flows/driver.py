@@ -18,8 +18,7 @@ from ..catalog.archive import ArchiveError
 from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
-from ..pipeline import description, response
-from ..pipeline.products import QUALITY_FLAGS
+from ..pipeline import description, strong_scintillation
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from . import logs
@@ -156,7 +155,8 @@ class Work:
     responses: Kept = field(init=False)
     workers: Workers = field(init=False)
     stopping: Event = field(default_factory=Event)
-    _matrices: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    spoiled: Event = field(default_factory=Event)
+    _matrices: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock)
 
     _warned: set[str] = field(default_factory=set)
@@ -174,16 +174,54 @@ class Work:
         if self.client.status in ("closing", "closed"):
             raise lost(self.settings)
 
-    def matrix(self, plan: ArchivePlan) -> NDArray[np.float64]:
-        """Response matrix, computed once for all archives of one geometry."""
+    def threads(self) -> int:
+        """Threads of all workers, at least one: what is sent waits for a worker to come."""
+        return max(1, sum(self.workers.known().values()))
+
+    def check_workers(self) -> None:
+        """Raise Unavailable where there has been no worker for too long."""
+        if self.workers.missing():
+            where = self.settings.run.scheduler or "this machine"
+            raise Unavailable(
+                f"the Dask scheduler at {where} has had no worker for {Workers.EMPTY:g} s; what was finished is kept, "
+                "start workers and give the same command again"
+            )
+
+    def usable_workers(self) -> list[str] | None:
+        """Workers that may be used; None for all of them."""
+        if not self.workers.refused:
+            return None
+        usable = list(self.workers.known())
+        if not usable:
+            raise Unavailable(
+                f"versions differ: {'; '.join(sorted(set(self.workers.refused.values())))}; install the same "
+                "environment everywhere"
+            )
+        return usable
+
+    def refuse(self, worker: str, reason: str) -> None:
+        """Send nothing more to a worker."""
+        self.workers.refuse(worker, reason)
+        self.warn(f"a worker is not used, for its versions differ: {reason}")
+
+    def warn(self, message: str) -> None:
+        """Say once what is no failure and yet to be known."""
+        with self._lock:
+            news = message not in self._warned
+            self._warned.add(message)
+        if news:
+            log.warning("%s", message)
+            self.progress.warned(message)
+
+    def responses_of(self, plan: ArchivePlan) -> dict[str, NDArray[Any]]:
+        """Response matrix M, and those of stronger scintillation; computed once for all archives of one geometry."""
         with self._lock:
             digest = str(plan.response_key)
             found = self._matrices.get(digest)
-            if found is None and (kept := self.responses.load(digest)) is not None:
-                found = kept["M"]
             if found is None:
-                parameters = self.settings.configuration.response
-                found = response.response_matrix(
+                found = self.responses.load(digest)
+            if found is None:
+                found = strong_scintillation.responses(
                     plan.geometry,
                     plan.grid,
                     plan.spectrum,
@@ -191,7 +229,7 @@ class Work:
                     self.settings.configuration.response,
                 )
                 with suppress(OSError):  # a cache that cannot be written only costs time
-                    self.responses.save(digest, {"M": found})
+                    self.responses.save(digest, found)
             self._matrices[digest] = found
             return found
 
@@ -211,16 +249,20 @@ def kept_correlations(root: Path) -> Kept:
 
 def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
     """What turns correlations of this archive into profiles."""
+    responses = work.responses_of(plan)
     return stages.Model(
         geometry=plan.geometry,
         grid=plan.grid,
-        matrix=work.matrix(plan),
+        matrix=responses["M"],
         sampling=work.settings.configuration.response.sampling,
         regulariser=plan.regulariser,
         selector=plan.selector,
         inversion=work.settings.configuration.inversion,
         scintillometers=description.scintillometer_weights(
             plan.header, plan.grid, work.settings.configuration.response.sampling
+        ),
+        strong=strong_scintillation.from_responses(
+            responses, plan.geometry, plan.grid, work.settings.configuration.response.sampling
         ),
     )
 
@@ -341,6 +383,10 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
         "batch_duration": text(parameters.batch.duration, "s"),
         "sampling": parameters.response.sampling,
         "slope_response": parameters.response.slope_response,
+        "aperture": parameters.response.aperture,
+        "tilt": parameters.response.tilt,
+        "band": parameters.response.band.text() if parameters.response.band else "single wavelength",
+        "scintillation": parameters.response.scintillation,
         "covariance": parameters.correlation.covariance,
         "sources_used": parameters.correlation.sources,
         "source_model": settings.plugins["source"]["name"],

@@ -191,6 +191,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
     geometry = replace(geometry, positions=tuple(geometry.positions[number] for number in used))
     try:
         grid = configuration.response.grid(geometry)
+        configuration.response.options(geometry)
     except ValueError as error:
         raise InputError([f"{settings.origin}: {error}"]) from error
     models = settings.source_models(header, origin)
@@ -229,8 +230,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         "response",
         stages.RESPONSE_VERSION,
         tracked={
-            "sampling": configuration.response.sampling,
-            "slope_response": configuration.response.slope_response,
+            **configuration.response.tracked(),
             "edges": grid.edges,
             "mask": geometry.mask,
             "subaperture_size": geometry.subaperture_size,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -22,6 +22,7 @@ from . import (
     inversion,
     measurement,
     posterior,
+    strong_scintillation,
     timing,
     turbulence,
     uncertainty,
@@ -49,7 +50,7 @@ if TYPE_CHECKING:
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 3
 RESPONSE_VERSION = 1
-RETRIEVE_VERSION = 4
+RETRIEVE_VERSION = 5
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
@@ -103,6 +104,8 @@ class Model:
         Data used, unpenalised unknowns, estimator.
     scintillometers : ndarray, (n, k)
         Weight of each slice in the Cn2 of each scintillometer on the path; n = 0 without any.
+    strong : StrongScintillation, optional
+        Correction of the scintillation response; first order where it is absent.
     """
 
     geometry: Geometry
@@ -113,6 +116,7 @@ class Model:
     selector: HyperparameterSelector
     inversion: InversionParameters
     scintillometers: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    strong: strong_scintillation.StrongScintillation | None = None
 
 
 def measure(
@@ -346,17 +350,29 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         with contextlib.suppress(ValueError, np.linalg.LinAlgError):
             around.append(_whitened(other, model).problem(*_known(other, model), grid=grid))
     try:
-        reduction, known = _whitened(reduced, model), _known(reduced, model)
-        profile = inversion.estimate(
-            reduction,
-            *known,
-            model.selector,
-            grid=grid,
-            neighbours=around,
-            estimator=model.inversion.estimator,
-            # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
-            seed=reduced.start // 1_000_000 % 2**31,
-        )
+        known = _known(reduced, model)
+
+        def estimate(model: Model) -> tuple[inversion.Reduction, inversion.Profile]:
+            reduction = _whitened(reduced, model)
+            profile = inversion.estimate(
+                reduction,
+                *known,
+                model.selector,
+                grid=grid,
+                neighbours=around,
+                estimator=model.inversion.estimator,
+                # Another seed for each batch, so that what sampling adds to the intervals averages out over a campaign.
+                seed=reduced.start // 1_000_000 % 2**31,
+            )
+            return reduction, profile
+
+        reduction, profile = estimate(model)
+        rounds, unsettled, first_order = 0, model.strong is not None, model.matrix
+        while model.strong is not None and unsettled and rounds < strong_scintillation.ROUNDS:
+            before, rounds = model.matrix, rounds + 1
+            model = replace(model, matrix=model.strong.matrix(first_order, profile.cn2))
+            reduction, profile = estimate(model)
+            unsettled = strong_scintillation.moved(before, model.matrix)
         problem = reduction.problem(*known, grid=grid)
         others = profile.mu * np.array(MU_FACTORS)
         other_cn2 = np.stack([inversion.solve_positive(problem, mu) for mu in others])
@@ -392,7 +408,7 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         return turbulence.path_average(cn2, grid.thickness)
 
     light = (grid, geometry.wavelength, geometry.path_length)
-    point = float(turbulence.point_source_index(profile.cn2, *light, sampling=model.sampling))
+    point = profile.cn2 * turbulence.point_source_weights(*light, sampling=model.sampling)
     slope_noise, slope_noise_error = joint("noise_bias_x", "noise_bias_y")
     intensity_noise, intensity_noise_error = joint("noise_bias_i")
     offset, offset_error = joint("slope_offset_x", "slope_offset_y")
@@ -425,7 +441,10 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "scintillation_index_direct": arrays["scintillation_index"],
         "scintillation_index_profile": index(profile.cn2),
         "scintillation_index_interval_68": interval(index),
-        "scintillation_index_point": point,
+        "scintillation_index_point": point.sum(),
+        "scintillation_index_point_slice": point,
+        "strong_slice": ~turbulence.is_weak(point),
+        "scintillation_rounds": rounds,
         "mean_flux": arrays["mean_flux"],
         "noise_variance_slope": slope_noise,
         "noise_variance_slope_error": slope_noise_error,
@@ -452,7 +471,8 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         ("mu_at_edge", profile.selection.at_edge),
         ("negative_noise", negative),
         ("poor_fit", profile.chi2_reduced > 3),
-        ("strong_scintillation", point > 0.3),
+        ("strong_scintillation", not turbulence.is_weak(point.sum())),
+        ("unsettled_correction", unsettled),
     ):
         quality |= QUALITY_FLAGS[name][0] * bool(applies)
     return BatchResult(

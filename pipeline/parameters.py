@@ -14,6 +14,7 @@ from contextvars import ContextVar
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -24,6 +25,7 @@ from pydantic import (
     model_validator,
 )
 
+from .band import Band
 from .geometry import Geometry, SliceGrid
 from .units import (
     Angle,
@@ -39,6 +41,7 @@ from .units import (
     QuantityError,
     Wavelength,
     parse,
+    text,
 )
 
 #: Format of raw archives that this version reads and writes.
@@ -69,15 +72,22 @@ class BatchParameters(Parameters):
 class ExtractionParameters(Parameters):
     """How slopes and fluxes are measured on the frames."""
 
-    method: Literal["subpixel_window", "moving_maximum"] = "subpixel_window"
+    method: Literal["subpixel_window", "moving_maximum", "thresholded", "weighted", "template"] = "subpixel_window"
     """`subpixel_window`: window with fractional edge weights re-centred on its own centroid;
-    `moving_maximum`: whole-pixel window centred on the brightest pixel (Sauvage et al. 2021, section 3.2)."""
+    `moving_maximum`: whole-pixel window centred on the brightest pixel (Sauvage et al. 2021, section 3.2);
+    `thresholded`: centroid of what exceeds a part of the brightest pixel; `weighted`: centroid under a Gaussian weight
+    that follows it; `template`: fit of the mean spots of both sources. The flux is the plain sum over the window, or
+    that of the fit."""
     window_x: Pixels | None = Field(default=None, gt=0)
     """Width of the window along x; as large as box and sources allow where it is absent."""
     window_y: Pixels | None = Field(default=None, gt=0)
     """Height of the window along y; as large as the other source allows where it is absent."""
     passes: int = Field(default=3, ge=1, le=20)
-    """How often the sub-pixel window is re-centred on its own centroid."""
+    """How often window, threshold, weight or fit are re-centred on the position that they gave."""
+    threshold: float = Field(default=0.1, ge=0, lt=1)
+    """Of `thresholded`: part of the brightest pixel in the window."""
+    weight_fwhm: Pixels | None = Field(default=None, gt=0)
+    """Of `weighted`: full width at half maximum of the weight; twice that of the spot where it is absent."""
     search: Pixels = Field(default="4 pixel", ge=1)  # type: ignore[assignment]
     """How far from its mean position a spot is looked for, along each axis."""
     reference_frames: int = Field(default=256, ge=1)
@@ -108,6 +118,66 @@ class CorrelationParameters(Parameters):
     absent."""
 
 
+#: Most points of a tabulated band.
+_MAX_BAND = 2000
+
+
+class BandParameters(Parameters):
+    """Spectral weight of the detector, linear between the given wavelengths.
+
+    Written as `"3.4 um:4.2 um"` (flat), as a table with `wavelength` and `weight`, or as a table with `file` and `unit`
+    (on the command line `"file=filter.csv,unit=um"`): text with a wavelength in that unit and a weight on each line.
+    """
+
+    wavelength: tuple[Wavelength, ...]
+    """Increasing wavelengths."""
+    weight: tuple[Annotated[float, Field(ge=0, allow_inf_nan=False)], ...] = ()
+    """Counts per wavelength interval at each of them, in any unit; flat where it is absent."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, data: Any) -> Any:
+        if isinstance(data, str):
+            if "=" in data:
+                data = dict(part.strip().split("=", 1) for part in data.split(",") if "=" in part)
+            else:
+                data = {"wavelength": [part.strip() for part in data.split(":")]}
+        if not isinstance(data, dict):
+            raise ValueError("write '3.4 um:4.2 um', or a table with wavelength and weight, or one with file and unit")
+        if "file" not in data:
+            if "unit" in data:
+                raise ValueError("unit belongs to a file; wavelengths in a table carry their own, '3.4 um'")
+            return data
+        if set(data) != {"file", "unit"}:
+            raise ValueError("a band from a file has the keys file and unit and no other, unit = 'um' for example")
+        path = str(data["file"])
+        try:
+            values = np.loadtxt(path, delimiter="," if path.endswith(".csv") else None, ndmin=2)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"'{path}' cannot be read as lines of a wavelength and a weight ({error})") from error
+        if values.shape[1] != 2:
+            raise ValueError(f"'{path}' must hold two columns, wavelength and weight; it has {values.shape[1]}")
+        # The path is dropped: a band built from its own values is the same band.
+        wavelengths = [f"{wavelength!r} {data['unit']}" for wavelength in values[:, 0].tolist()]
+        return {"wavelength": wavelengths, "weight": values[:, 1].tolist()}
+
+    @model_validator(mode="after")
+    def _usable(self) -> BandParameters:
+        if not 2 <= len(self.wavelength) <= _MAX_BAND:
+            raise ValueError(f"a band has 2 to {_MAX_BAND} wavelengths, not {len(self.wavelength)}; '3.4 um:4.2 um'")
+        self.band()
+        return self
+
+    def band(self) -> Band:
+        """The weight as the response takes it."""
+        return Band(self.wavelength, self.weight or (1.0,) * len(self.wavelength))
+
+    def text(self) -> str:
+        """The band in a few words."""
+        low, high = (text(value * 1e6, "um") for value in (self.wavelength[0], self.wavelength[-1]))
+        return f"{low} to {high}, {'weighted' if len(set(self.weight)) > 1 else 'flat'}"
+
+
 class ResponseParameters(Parameters):
     """The linear model that turns a Cn2 profile into correlation maps."""
 
@@ -117,6 +187,15 @@ class ResponseParameters(Parameters):
     """Response averaged over each slice, or taken at its mid-point."""
     slope_response: Literal["centroid", "printed"] = "centroid"
     """With the scintillation of the source's points in the centroid, or as printed in the paper."""
+    aperture: Literal["square", "circular"] = "square"
+    """Shape of a subaperture, whose side or diameter is the header's `subaperture_size`."""
+    tilt: Literal["gradient", "zernike"] = "gradient"
+    """What a slope is: the mean gradient over the subaperture, as the centre of gravity sees it, or the tilt of the
+    best-fitting plane, as the peak of a sharp spot does."""
+    band: BandParameters | None = None
+    """Spectral weight of the detector; the header's wavelength alone where it is absent."""
+    scintillation: Literal["first_order", "extended_rytov"] = "first_order"
+    """Scintillation of weak turbulence, or corrected for moderate strength in several rounds of inversion."""
     extent: Length | None = Field(default=None, gt=0)
     """Where the slices end; required for sources at infinity, the path length where it is absent."""
 
@@ -134,6 +213,36 @@ class ResponseParameters(Parameters):
         if end > geometry.path_length:
             raise ValueError(f"response.extent = {end:g} m lies beyond the sources at {geometry.path_length:g} m")
         return SliceGrid.uniform(end, self.slices)
+
+    def options(self, geometry: Geometry) -> dict[str, Any]:
+        """Arguments of :func:`~coslidar.pipeline.response.response_matrix` beside geometry, slices and plugins.
+
+        Raises
+        ------
+        ValueError
+            The band does not hold the wavelength of the geometry, or a correction does not know its path.
+        """
+        if self.band is not None and not self.band.wavelength[0] <= geometry.wavelength <= self.band.wavelength[-1]:
+            raise ValueError(
+                f"response.band = '{self.band.text()}' does not hold instrument.wavelength = "
+                f"'{text(geometry.wavelength * 1e6, 'um')}'; one of them is wrong"
+            )
+        if self.scintillation == "extended_rytov" and geometry.infinite:
+            raise ValueError(
+                "response.scintillation = 'extended_rytov' is for spherical waves, but the path is infinite; "
+                "write 'first_order'"
+            )
+        return {
+            "sampling": self.sampling,
+            "slope_response": self.slope_response,
+            "aperture": self.aperture,
+            "tilt": self.tilt,
+            "band": None if self.band is None else self.band.band(),
+        }
+
+    def tracked(self) -> dict[str, Any]:
+        """What of them decides the response of given slices."""
+        return self.model_dump(exclude={"slices", "extent"})
 
 
 class InversionParameters(Parameters):

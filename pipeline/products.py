@@ -165,6 +165,9 @@ SCHEMA = _schema(
     ("scintillation_index_profile", "time", "1", "float64", "aperture- and source-averaged index of the profile"),
     ("scintillation_index_interval_68", "time bound", "1", "float64", "shortest interval of it holding 68 %"),
     ("scintillation_index_point", "time", "1", "float64", "index of one point of the source, from the profile"),
+    ("scintillation_index_point_slice", "time z", "1", "float64", "contribution of each slice to that index"),
+    ("strong_slice", "time z", "1", "uint8", "1 where that contribution alone ends first-order theory"),
+    ("scintillation_rounds", "time", "1", "int64", "rounds of the correction for strong scintillation"),
     ("mean_flux", "time source", "count", "float64", "mean flux of a spot"),
     ("noise_variance_slope", "time axis", "rad^2", "float64", "detection noise of the slopes, joint estimate"),
     ("noise_variance_intensity", "time", "1", "float64", "detection noise of the relative flux, joint estimate"),
@@ -250,6 +253,7 @@ QUALITY_FLAGS: dict[str, tuple[int, int, str]] = {
     "not_lognormal": (131072, 1, "the log-amplitude is not Gaussian"),
     "rytov_limit": (262144, 2, "a measured scintillation index is above 1.2, the limit of weak perturbations"),
     "not_stationary": (524288, 1, "a variance differs between the thirds of the batch by more than 30 % and chance"),
+    "unsettled_correction": (1048576, 1, "the rounds of the correction for strong scintillation do not settle"),
 }
 
 

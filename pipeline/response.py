@@ -17,7 +17,7 @@ with the separation s of the sources: the ridge of the cross maps lies at d = m 
 source scintillates on its own and is imaged at s / L, so the centroid also moves by the intensity-weighted mean of
 s / L. For a Gaussian source of standard deviation sigma_l the two slope terms are
 -2 pi i f_l F conj(P~) (cos X - (2 k m sigma_l^2 / L) sin X). `slope_response="printed"` leaves the second term out, as
-the paper does.
+the paper does. A detector band puts the weighted means of cos X and k sin X in their places (see :mod:`.band`).
 
 Near f = 0 the slope integrand goes as f^(-5/3): no grid that is uniform in f holds it. The integral is taken in polar
 coordinates, over shells of geometrically growing radius with Gauss-Legendre panels in u = f^(1/3), in which that
@@ -38,6 +38,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from scipy.special import j1, jv
 
+from .band import Band
+from .extended_rytov import suppression
 from .geometry import MAP_KINDS
 
 if TYPE_CHECKING:
@@ -101,6 +103,8 @@ def response_matrix(
     slope_response: SlopeResponse = "centroid",
     aperture: Aperture = "square",
     tilt: Tilt = "gradient",
+    band: Band | None = None,
+    point_index: float = 0.0,
 ) -> Array:
     """Matrix M of the direct model, maps = M Cn2 (Sauvage et al. 2021, Eq. (22)).
 
@@ -122,6 +126,11 @@ def response_matrix(
         Shape of a subaperture of size d.
     tilt : {"gradient", "zernike"}
         Slope as the mean gradient over the subaperture, or as the tilt of the best-fitting plane.
+    band : Band, optional
+        Spectral weight of the detector; the single wavelength of the geometry where it is absent.
+    point_index : float
+        First-order scintillation index of one point of the source at which the scintillation response is taken, by
+        the filters of :func:`~coslidar.pipeline.extended_rytov.suppression`; 0 is first order.
 
     Returns
     -------
@@ -141,7 +150,7 @@ def response_matrix(
         raise ValueError(f"sampling must be 'mean' or 'midpoint', got {sampling!r}")
     if grid.edges[-1] > geometry.path_length:
         raise ValueError(f"a slice ends at {grid.edges[-1]:g} m, beyond the sources at {geometry.path_length:g} m")
-    model = _model(geometry, spectrum, sources, slope_response, aperture, tilt)
+    model = _model(geometry, spectrum, sources, slope_response, aperture, tilt, band, point_index)
     columns = []
     for z0, z1 in itertools.pairwise(grid.edges):
         if sampling == "midpoint":
@@ -161,12 +170,14 @@ def response(
     *,
     aperture: Aperture = "square",
     tilt: Tilt = "gradient",
+    band: Band | None = None,
+    point_index: float = 0.0,
 ) -> Array:
     """Response functions W of one thin layer (Sauvage et al. 2021, Eqs. (8)-(10)).
 
     Parameters
     ----------
-    geometry, spectrum, sources, slope_response, aperture, tilt
+    geometry, spectrum, sources, slope_response, aperture, tilt, band, point_index
         As for :func:`response_matrix`.
     z : float
         Distance of the layer from the pupil, m, in [0, L].
@@ -185,7 +196,7 @@ def response(
     """
     if not (0 <= z <= geometry.path_length and math.isfinite(z)):
         raise ValueError(f"the layer at {z:g} m is not between pupil and sources (0 to {geometry.path_length:g} m)")
-    return _at(_model(geometry, spectrum, sources, slope_response, aperture, tilt), z)
+    return _at(_model(geometry, spectrum, sources, slope_response, aperture, tilt, band, point_index), z)
 
 
 @dataclass(frozen=True)
@@ -197,15 +208,13 @@ class _Model:
     sources: tuple[SourceModel, ...]  # one where both are the same
     centroids: tuple[tuple[float, float], ...]
     extent: tuple[float, float]  # half-widths that hold the largest source, x and y
-    centroid_term: float  # 2 k / L, 0 where the term is left out
+    centroid_term: float  # 2 / L, 0 where the term is left out
+    band: Band
+    point_index: float
     aperture: Aperture
     tilt: Tilt
     power: float  # n in f = u^n
     even: bool  # sources symmetric about both axes: a quadrant of frequencies tells all
-
-    @property
-    def wavenumber(self) -> float:
-        return 2 * math.pi / self.geometry.wavelength
 
 
 def _model(
@@ -215,6 +224,8 @@ def _model(
     slope_response: str,
     aperture: str,
     tilt: str,
+    band: Band | None,
+    point_index: float,
 ) -> _Model:
     for name, value, known in (
         ("slope_response", slope_response, ("centroid", "printed")),
@@ -223,6 +234,8 @@ def _model(
     ):
         if value not in known:
             raise ValueError(f"{name} must be '{known[0]}' or '{known[1]}', got {value!r}")
+    if not (0 <= point_index < math.inf) or (point_index and geometry.infinite):
+        raise ValueError(f"point_index must be 0 or, on a finite path, more; got {point_index!r}")
     if len(sources) != geometry.n_sources:
         raise ValueError(f"the geometry has {geometry.n_sources} sources, but {len(sources)} source models are given")
     kept = tuple(sources[:1]) if all(source == sources[0] for source in sources) else tuple(sources)
@@ -233,14 +246,15 @@ def _model(
         centroids.append((float(np.real(mx[0])), float(np.real(my[0]))))
     extents = np.array([_extent(source) for source in kept])
     inverse_length = 1.0 if geometry.infinite else 1 / geometry.path_length
-    term = 4 * math.pi / geometry.wavelength * inverse_length if slope_response == "centroid" else 0.0
     return _Model(
         geometry,
         spectrum,
         kept,
         tuple(centroids),
         (float(extents[:, 0].max()), float(extents[:, 1].max())),
-        term,
+        2 * inverse_length if slope_response == "centroid" else 0.0,
+        band or Band((geometry.wavelength,), (1.0,)),
+        float(point_index),
         aperture,  # type: ignore[arg-type]
         tilt,  # type: ignore[arg-type]
         _radial_power(spectrum),
@@ -418,10 +432,10 @@ class _Effort:
     without_fringe: bool = False
 
 
-def _fringe_frequency(model: _Model) -> float:
+def _fringe_frequency(model: _Model, wavelength: float) -> float:
     """Frequency s / (2 lambda L) at which the phase 2X of any layer is stationary against that of the shift m s."""
     length = 1.0 if model.geometry.infinite else model.geometry.path_length
-    return math.hypot(*model.geometry.separation) / (2 * model.geometry.wavelength * length)
+    return math.hypot(*model.geometry.separation) / (2 * wavelength * length)
 
 
 def _turns_of_fringe(model: _Model, z: float) -> float:
@@ -430,7 +444,7 @@ def _turns_of_fringe(model: _Model, z: float) -> float:
     if z == geometry.path_length:
         return math.inf
     reach = math.hypot(*geometry.separation) * geometry.magnification(z)
-    return reach**2 / (4 * geometry.wavelength * z * geometry.scaling(z)) if z else 0.0
+    return reach**2 / (4 * model.band.centre * z * geometry.scaling(z)) if z else 0.0
 
 
 def _effort(model: _Model, z0: float, z1: float) -> tuple[_Effort, Array | None]:
@@ -441,7 +455,8 @@ def _effort(model: _Model, z0: float, z1: float) -> tuple[_Effort, Array | None]
     that is long work the orders are checked without it, and there are no maps to hand on.
     """
     effort = _Effort()
-    frequency = _fringe_frequency(model)
+    shortest, longest = model.band.limits
+    frequency = _fringe_frequency(model, longest)
     if frequency:
         sx, sy = (frequency * s / math.hypot(*model.geometry.separation) for s in model.geometry.separation)
         m = model.geometry.magnification(z0)
@@ -450,7 +465,8 @@ def _effort(model: _Model, z0: float, z1: float) -> tuple[_Effort, Array | None]
         )
         if left > 3e-4:
             often = _turns_of_fringe(model, z1) - _turns_of_fringe(model, z0) > _FRINGE_TURNS
-            effort = _Effort(lowest=0.0 if often else 1.4 * frequency, without_fringe=often)
+            highest = _fringe_frequency(model, shortest)
+            effort = _Effort(lowest=0.0 if often else 1.4 * highest, without_fringe=often)
     z = (z0 + z1) / 2
     long = 2 * math.pi * _reach(model, np.array([z]), True) * effort.lowest > _LONG
     tried = replace(effort, lowest=0.0) if long else effort
@@ -522,12 +538,15 @@ def _shells(model: _Model, z: Array, reach: float, effort: _Effort, crossed: boo
     stationary and its oscillation leaves nothing in the maps: it is faded out there instead of followed to the end.
     """
     geometry = model.geometry
-    bends = [2 * math.pi * geometry.wavelength * float(a) * geometry.scaling(float(a)) for a in z]
-    bend = max(bends)
+    shortest, longest = model.band.limits
+    delays = [2 * math.pi * float(a) * geometry.scaling(float(a)) for a in z]
+    bend, least = longest * max(delays), shortest * min(delays)
+    # Where the fringes have faded, those between the wavelengths of a band remain.
+    beat = (longest - shortest) * max(delays)
     swing = 2 * math.pi * reach
-    fade = max(2 * swing / min(bends), math.sqrt(300 / min(bends))) if min(bends) else math.inf
+    fade = max(2 * swing / least, math.sqrt(300 / least)) if least else math.inf
     if crossed and effort.without_fringe:
-        fade = 0.5 * _fringe_frequency(model)
+        fade = 0.5 * _fringe_frequency(model, longest)
 
     start = min(6 / swing, 1 / math.sqrt(bend) if bend else math.inf)
     edges = [0.0] + [start * 8.0**-level for level in range(4, 0, -1)]
@@ -536,7 +555,7 @@ def _shells(model: _Model, z: Array, reach: float, effort: _Effort, crossed: boo
         edges.append(outer)
         radii, weights, inner = [], [], edges[0]
         for a, b in itertools.pairwise(edges):
-            turned = swing * (b - a) + (bend * (b * b - a * a) if a < _SHELL_RATIO * fade else 0.0)
+            turned = swing * (b - a) + (bend if a < _SHELL_RATIO * fade else beat) * (b * b - a * a)
             panels = max(1, math.ceil(turned / 60))
             nodes, rule = _legendre(math.ceil(effort.resolution * (_NODES_PER_RADIAN * turned / panels + 8)))
             cuts = np.linspace(a, b, panels + 1) ** (1 / model.power)
@@ -617,8 +636,7 @@ def _shell_maps(model: _Model, z: Array, rules: Array, kinds: tuple[int, ...], s
         f = shell.f[part, None]
         fx, fy = f * cosine, f * sine
         along_x, along_y = _harmonics(fx.ravel(), d, q), _harmonics(fy.ravel(), d, p)
-        own = tuple(values[:, part, None] for values in radial)
-        densities = _densities(model, z, fx, fy, own, kinds, shell.fringes is None)
+        densities = _densities(model, z, fx, fy, radial.part(part), kinds)
         basis: dict[int, Array] = {}
         for block, products, density in densities:
             # (layers, kinds, radii, angles) -> (whole or tapered, rules, kinds, nodes)
@@ -651,19 +669,51 @@ def _harmonics(f: Array, d: float, n: int) -> tuple[Array, Array]:
     return np.ascontiguousarray(powers.real), np.ascontiguousarray(powers.imag)
 
 
-def _radial(model: _Model, z: Array, shell: _Shell) -> tuple[Array, Array, Array]:
-    """Weighted index spectrum, cos X and sin X of every layer and radius, (layers, radii) each.
+@dataclass(frozen=True)
+class _Radial:
+    """What depends on layer and modulus of the frequency only, (layers, radii) each.
 
-    Where the fringes fade, what is left of cos 2X and sin 2X instead.
+    Parameters
+    ----------
+    power, bright : ndarray
+        Weighted index spectrum, for slopes and for scintillation.
+    factors : tuple of ndarray
+        Where all of the fringes are followed, cos X and k sin X, means over the band; where they fade, what is left of
+        their squares and of their product.
     """
-    scaling = np.array([model.geometry.scaling(float(a)) for a in z])[:, None]
-    x = np.pi * model.geometry.wavelength * z[:, None] * scaling * shell.f**2
+
+    power: Array
+    bright: Array
+    factors: tuple[Array, ...]
+
+    def part(self, radii: slice) -> _Radial:
+        factors = tuple(factor[:, radii, None] for factor in self.factors)
+        return _Radial(self.power[:, radii, None], self.bright[:, radii, None], factors)
+
+
+def _radial(model: _Model, z: Array, shell: _Shell) -> _Radial:
+    geometry = model.geometry
+    scaling = np.array([geometry.scaling(float(a)) for a in z])[:, None]
+    zeta = z[:, None] * scaling * shell.f**2
+    turn = np.exp(1j * np.pi * model.band.centre * zeta)
+    c, s = (envelope * turn for envelope in model.band.envelopes(zeta))
+    factors: tuple[Array, ...] = (c.real, s.imag)
+    if shell.fringes is not None:
+        # Of the product of two real parts, half is the product of the numbers, which turns, and half that of one with
+        # the other's conjugate, which does not.
+        factors = (
+            (np.abs(c) ** 2 + shell.fringes * (c * c).real) / 2,
+            (np.abs(s) ** 2 - shell.fringes * (s * s).real) / 2,
+            ((np.conj(c) * s).imag + shell.fringes * (c * s).imag) / 2,
+        )
     # The rest of the circle holds the same values, or their complex conjugates.
     measure = shell.weight * shell.f * (2 * np.pi / shell.angle.size)
     spectrum = np.stack([model.spectrum.psd(float(a) * shell.f) for a in scaling[:, 0]])
-    if shell.fringes is None:
-        return scaling**2 * spectrum * measure, np.cos(x), np.sin(x)
-    return scaling**2 * spectrum * measure, shell.fringes * np.cos(2 * x), shell.fringes * np.sin(2 * x)
+    power = scaling**2 * spectrum * measure
+    bright = power
+    if model.point_index:
+        bright = power * suppression(scaling * shell.f, geometry.wavelength, geometry.path_length, model.point_index)
+    return _Radial(power, bright, factors)
 
 
 def _aperture(model: _Model, fx: Array, fy: Array) -> tuple[Array, Array, Array]:
@@ -696,12 +746,12 @@ _Amplitudes = list[tuple["NDArray[Any]", "NDArray[Any]"]]
 def _amplitudes(
     model: _Model, m: float, fx: Array, fy: Array, filters: tuple[Array, Array, Array]
 ) -> list[_Amplitudes]:
-    """Factors of cos X and sin X in the amplitudes of slopes x and y, times i, and of scintillation, for each source.
+    """Factors of cos X and k sin X in the amplitudes of slopes x and y, times i, and of scintillation, for each source.
 
     They are real for even sources.
     """
     mean, *tilts = filters
-    glint, flux = model.centroid_term * mean, 2 * model.wavenumber * mean
+    glint, flux = model.centroid_term * mean, 2 * mean
     amplitudes = []
     for source, centroid in zip(model.sources, model.centroids, strict=True):
         transfer = source.transfer(m * fx, m * fy)
@@ -721,19 +771,20 @@ def _amplitudes(
 def _product(
     first: tuple[NDArray[Any], NDArray[Any]],
     second: tuple[NDArray[Any], NDArray[Any]],
-    radial: tuple[Array, Array, Array],
-    coherent: bool,
+    power: Array,
+    factors: tuple[Array, ...],
 ) -> NDArray[Any]:
-    """Density of the product of two amplitudes, first times conj(second)."""
-    power, c, s = radial
-    if coherent:
+    """Density of the product of two amplitudes, first times conj(second), for one layer (see `_Radial`)."""
+    if len(factors) == 2:
+        c, s = factors
         a = c * first[0] + s * first[1]
         if first is second:
             return np.asarray(power * (a * a if not np.iscomplexobj(a) else np.abs(a) ** 2))
         return np.asarray(power * (a * np.conj(c * second[0] + s * second[1])))
+    cc, ss, cs = factors
     tilts, glints = first[0] * np.conj(second[0]), first[1] * np.conj(second[1])
     mixed = first[0] * np.conj(second[1]) + first[1] * np.conj(second[0])
-    return np.asarray(power / 2 * ((1 + c) * tilts + (1 - c) * glints + s * mixed))
+    return np.asarray(power * (cc * tilts + ss * glints + cs * mixed))
 
 
 def _densities(
@@ -741,9 +792,8 @@ def _densities(
     z: Array,
     fx: Array,
     fy: Array,
-    radial: tuple[Array, ...],
+    radial: _Radial,
     kinds: tuple[int, ...],
-    coherent: bool,
 ) -> list[tuple[slice, tuple[tuple[int, int], ...], Array]]:
     """Spectral densities of the kinds: for each block of kinds the products it enters, with sign, and the density.
 
@@ -760,15 +810,16 @@ def _densities(
     for layer, distance in enumerate(z):
         m = geometry.magnification(float(distance))
         amplitudes = _amplitudes(model, m, fx, fy, filters)
-        here = (radial[0][layer], radial[1][layer], radial[2][layer])
+        factors = tuple(factor[layer] for factor in radial.factors)
         turns = _turns(phases, m, model.even) if crossed else {}
         for kind in range(3):
             first, second = amplitudes[0][kind], amplitudes[-1][kind]
-            density = _product(first, second, here, coherent)
+            power = (radial.bright if kind == 2 else radial.power)[layer]
+            density = _product(first, second, power, factors)
             if autos is not None and first is second:
                 autos[layer, kind] = np.real(density)
             elif autos is not None:
-                each = [np.real(_product(one, one, here, coherent)) for one in (first, second)]
+                each = [np.real(_product(one, one, power, factors)) for one in (first, second)]
                 autos[layer, kind] = (each[0] + each[1]) / 2
             for product, turn in turns.items():
                 if product not in terms:

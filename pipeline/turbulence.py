@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 Sampling = Literal["mean", "midpoint"]
 
-#: First-order index of one point of the source above which first-order theory is off by more than about 5 %: wave
-#: optics gives 0.99, 0.95 and 0.88 of the first-order scintillation where that index is near 0.1, 0.4 and 0.9 (profiles
-#: of one shape whose index averaged over the source is 0.014, 0.05 and 0.12).
-WEAK_INDEX = 0.4
+#: First-order index of one point of the source above which first-order theory is off by 3 % and more: wave optics gives
+#: 0.99, 0.95 and 0.88 of the first-order scintillation where that index is 0.11, 0.38 and 0.91 (profiles of one shape
+#: whose index averaged over the source is 0.014, 0.05 and 0.12).
+WEAK_INDEX = 0.3
 
 
 def z_max(geometry: Geometry) -> float:

@@ -161,6 +161,11 @@ def _header(archive: str | None, campaign: Path | None) -> tuple[Header, Setting
     type=click.Choice(["centroid", "printed"]),
     help="With the centroid term, or as printed.",
 )
+@click.option("--aperture", type=click.Choice(["square", "circular"]), help="Shape of a subaperture.")
+@click.option("--tilt", type=click.Choice(["gradient", "zernike"]), help="Mean gradient, or best-fitting plane.")
+@click.option(
+    "--band", help="Band of the detector: '3.4 um:4.2 um', flat, or 'file=filter.csv,unit=um' with its weight."
+)
 @click.option("--extent", help="Where the slices end, needed for sources at infinity: '10 km'.")
 @click.option("--spectrum", help="NAME[:parameter=value,…], for example 'von_karman:outer_scale=10 m'.")
 @click.option("--source", help="NAME[:parameter=value,…], for example 'gaussian:fwhm_x=8.9 cm,fwhm_y=6.3 cm'.")
@@ -172,6 +177,9 @@ def response(
     slices: int | None,
     sampling: str | None,
     slope_response: str | None,
+    aperture: str | None,
+    tilt: str | None,
+    band: str | None,
     extent: str | None,
     spectrum: str | None,
     source: str | None,
@@ -193,7 +201,15 @@ def response(
     from ..settings import InputError, sentences_of, with_plugin
 
     header, settings, origin = _header(archive, campaign)
-    given = {"slices": slices, "sampling": sampling, "slope_response": slope_response, "extent": extent}
+    given = {
+        "slices": slices,
+        "sampling": sampling,
+        "slope_response": slope_response,
+        "aperture": aperture,
+        "tilt": tilt,
+        "band": band,
+        "extent": extent,
+    }
     base = settings.configuration.response.model_dump(mode="json", exclude_none=True)
     parameters = sentences_of(
         ResponseParameters,
@@ -209,6 +225,7 @@ def response(
     geometry = header.geometry()
     try:
         grid = parameters.grid(geometry)
+        options = parameters.options(geometry)
     except ValueError as error:
         raise InputError([f"{origin}: {error}"]) from error
     matrix = response_matrix(
@@ -216,8 +233,7 @@ def response(
         grid,
         settings.spectrum(),
         settings.source_models(header, origin),
-        sampling=parameters.sampling,
-        slope_response=parameters.slope_response,
+        **options,
     )
     rows = len(matrix) // len(MAP_KINDS)
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -231,6 +247,9 @@ def response(
         kind=np.repeat(MAP_KINDS, rows),
         sampling=parameters.sampling,
         slope_response=parameters.slope_response,
+        aperture=parameters.aperture,
+        tilt=parameters.tilt,
+        band=parameters.band.text() if parameters.band else "single wavelength",
         spectrum=str(settings.plugins["spectrum"]),
         source=str([model.identity() for model in settings.source_models(header, origin)]),
         wavelength=geometry.wavelength,

@@ -39,6 +39,10 @@ duration = "{duration}"             # averaging window of one profile
 # slices = 12
 # sampling = "mean"                 # over each slice; or "midpoint"
 # slope_response = "centroid"       # or "printed"
+# aperture = "square"               # or "circular"
+# tilt = "gradient"                 # or "zernike": best-fitting plane
+# band = "3.4 um:4.2 um"            # or {{file = "filter.csv", unit = "um"}}; one wavelength where absent
+# scintillation = "first_order"     # or "extended_rytov", for moderate strength
 # extent = "2 km"                   # end of the slices; needed for sources at infinity
 
 [inversion]
