@@ -214,7 +214,8 @@ def saturation_limit(path_length: float, near_diameter: float, far_diameter: flo
     """Cn2 above which the scintillometer no longer follows the turbulence.
 
     0.18 D^(5/3) lambda^(1/3) L^(-8/3) (Ochs and Wilson 1993, see :data:`SATURATION`): the disc L / (k rho_0) into which
-    the turbulence scatters grows to 0.36 D, rho_0 being the coherence radius. It was found for equal apertures; the smaller of unequal ones is taken, which errs on the safe side.
+    the turbulence scatters grows to 0.36 D, rho_0 being the coherence radius. It was found for equal apertures; the
+    smaller of unequal ones is taken, which errs on the safe side.
 
     Parameters
     ----------

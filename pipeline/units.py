@@ -223,6 +223,63 @@ def parse(value: object, unit: str, *, key: str = "value", allow_infinite: bool 
     return rounded(number * factor)
 
 
+#: Spellings of units that instruments write and pint does not know.
+_SPELLINGS = {"deg C": "degC", "degrees C": "degC", "celsius": "degC", "C": "degC", "%": "percent", "": "1"}
+#: Fractional exponents without parentheses: pint reads m^-2/3 as m^(-2) / 3, UDUNITS m-2/3 likewise.
+_BARE_FRACTION = re.compile(r"(?<=[A-Za-z])\s*(?:\^|\*\*)?\s*(-\s*\d+\s*/\s*\d+)(?!\s*[\d)])")
+#: Exponents as UDUNITS has them: W m-2.
+_BARE_EXPONENT = re.compile(r"(?<=[A-Za-z])(-?\d+)(?![\d/)])")
+
+
+def conversion(unit_text: str, unit: str) -> tuple[float, float, str]:
+    """How values in a unit that an instrument wrote become values in an SI unit.
+
+    Parameters
+    ----------
+    unit_text : str
+        Unit as written: ``"hPa"``, ``"deg C"``, ``"%"``, ``"m^(-2/3)"``, also ``"m^-2/3"``.
+    unit : str
+        SI unit; ``"1"`` without dimension.
+
+    Returns
+    -------
+    factor, offset : float
+        ``value * factor + offset`` is in `unit`.
+    remark : str
+        What was wrong with the spelling; empty where nothing was.
+
+    Raises
+    ------
+    QuantityError
+        The unit is unknown, or of another dimension.
+    """
+    import pint
+
+    registry = _registry()
+    plain = _SPELLINGS.get(unit_text.strip(), unit_text.strip())
+    written = _BARE_FRACTION.sub(lambda match: f"^({match[1].replace(' ', '')})", plain)
+    remark = "" if written == plain else f"'{safe(unit_text)}' says another thing than is meant; read as '{written}'"
+    try:
+        found, wanted = registry.Unit(_BARE_EXPONENT.sub(r"^(\1)", written)), registry.Unit(unit)
+        fault = _dimensionality(found) != _dimensionality(wanted)
+        zero, one = (0.0, 1.0) if fault else (registry.Quantity(x, found).to_root_units().magnitude for x in (0.0, 1.0))
+    except (
+        pint.errors.PintError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        KeyError,
+        SyntaxError,
+        AssertionError,
+    ) as error:
+        raise QuantityError(f"'{safe(unit_text)}' is no unit that is known; write for example '{unit}'") from error
+    if fault:
+        what = _describe(frozenset(_dimensionality(found).items()))
+        raise QuantityError(f"'{safe(unit_text)}' is {_article(what)}; a unit like '{unit}' is needed")
+    scale = float(str(registry.get_root_units(wanted)[0]))
+    return rounded((one - zero) / scale), rounded(zero / scale), remark
+
+
 #: Stands for the key in a reason that is kept until the whole location of the value is known.
 _KEY = "\N{SYMBOL FOR NULL}"
 
