@@ -271,8 +271,9 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
     """Process one archive; never raises for what is wrong with it."""
     with logs.about(run=work.run, archive=safe(url)):
         outcome = _outcome(url, work)
-        if outcome.status == "cancelled":
-            return outcome
+    if outcome.status == "cancelled":
+        return outcome
+    with logs.about(run=work.run, archive=outcome.name):
         if outcome.status in ("refused", "failed"):
             work.spoiled.set()
             for fault in outcome.faults:
@@ -402,6 +403,9 @@ def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:
         for key in ("name", "timezone"):
             if value := getattr(header.site, key):
                 attributes[f"site_{key}"] = value
+        for key in ("latitude", "longitude"):
+            if (value := getattr(header.site, key)) is not None:
+                attributes[f"site_{key}"] = text(value, "deg")
     return attributes
 
 
