@@ -23,6 +23,7 @@ from . import provenance as records
 from .database import Database, location, plain_text
 from .entries import batch_rows, plugin_rows, timezone_of
 from .products import ProductError, check_digest, check_name, open_product, product_bytes, sync_folder, write_temporary
+from .query import QueryError, understand
 from .releases import Releases, check_unreleased
 from .rows import (
     BATCHES,
@@ -401,6 +402,46 @@ class Catalog(RunLog, Releases, Upkeep):
         query = BATCHES.where(*wanted).order_by(batch.c.start, batch.c.product_id)
         with self.database.read() as connection:
             return [BatchRow(**row) for row in connection.execute(query).mappings()]
+
+    def query(self, text: str, *, limit: int | None = None) -> list[BatchRow]:
+        """Batches that a query asks for, in the order of their time.
+
+        Parameters
+        ----------
+        text : str
+            Conditions; see :mod:`coslidar.catalog.query`.
+        limit : int, optional
+            So many at most.
+
+        Returns
+        -------
+        list of BatchRow
+
+        Raises
+        ------
+        coslidar.catalog.query.QueryError
+            The query cannot be understood, or names a release that does not exist.
+        """
+        asked = understand(text)
+        known = {release.name for release in self.releases()} if any(t.field == "alias" for t in asked.terms) else set()
+        unknown = [
+            f"query, character {term.position}: alias={safe(name.strip())}: there is no release of this name"
+            for term in asked.terms
+            if term.field == "alias"
+            for name in term.value.split(",")
+            if name.strip() not in known
+        ]
+        if unknown:
+            raise QueryError(unknown)
+        with self.database.read() as connection:
+            return [BatchRow(**row) for row in connection.execute(asked.batches(limit)).mappings()]
+
+    def recording(self, row: ProductRow) -> tuple[str, dict[str, Any]]:
+        """Where the archive of a product was last seen, and the header that it was processed with."""
+        query = sa.select(archive.c.url, archive.c.header).where(archive.c.identity == row.archive_identity)
+        with self.database.read() as connection:
+            found = connection.execute(query).one()
+        return str(found.url), dict(found.header)
 
     def open(self, row: ProductRow) -> Dataset:
         """Read a product; see :func:`coslidar.catalog.products.open_product`."""
