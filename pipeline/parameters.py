@@ -322,6 +322,20 @@ Text = str
 Pixel = Annotated[float, Field(strict=False, allow_inf_nan=False)]
 
 
+def _time_zone(value: str) -> str:
+    from zoneinfo import ZoneInfo
+
+    try:
+        ZoneInfo(value)
+    except (ValueError, OSError, KeyError) as error:
+        raise ValueError("no such time zone; write for example 'Europe/Paris' or 'UTC'") from error
+    return value
+
+
+#: Name of a time zone, as in the IANA data base.
+TimeZone = Annotated[str, AfterValidator(_time_zone)]
+
+
 class HeaderPart(BaseModel):
     """Part of a header: frozen, unknown keys kept and handed on."""
 
@@ -334,19 +348,7 @@ class Site(HeaderPart):
     name: Text | None = None
     latitude: Annotated[float, Quantity("deg")] | None = Field(default=None, ge=-90, le=90)
     longitude: Annotated[float, Quantity("deg")] | None = Field(default=None, ge=-180, le=360)
-    timezone: Text | None = None
-
-    @field_validator("timezone")
-    @classmethod
-    def _known(cls, value: str | None) -> str | None:
-        from zoneinfo import ZoneInfo
-
-        if value is not None:
-            try:
-                ZoneInfo(value)
-            except (ValueError, OSError, KeyError) as error:
-                raise ValueError("no such time zone; write for example 'Europe/Paris' or 'UTC'") from error
-        return value
+    timezone: TimeZone | None = None
 
 
 class Instrument(HeaderPart):
