@@ -95,12 +95,8 @@ class Batches:
                 self._take(outcome)
         return [self.done[window.index] for window in self.plan.windows]
 
-    def _around(self, window: BatchWindow) -> Iterable[BatchWindow]:
-        windows, reach = self.plan.windows, self.plan.reach
-        return windows[max(0, window.index - reach) : window.index + reach + 1]
-
     def _without_correlations(self, todo: list[BatchWindow]) -> list[BatchWindow]:
-        needed = {near.index: near for window in todo for near in self._around(window)}
+        needed = {near.index: near for window in todo for near in self.plan.around(window)}
         return [window for _, window in sorted(needed.items()) if self._reduced(window) is None]
 
     def _reduced(self, window: BatchWindow) -> ReducedBatch | None:
@@ -109,7 +105,7 @@ class Batches:
 
     def _neighbours(self, window: BatchWindow) -> tuple[ReducedBatch, ...]:
         found = []
-        for near in self._around(window):
+        for near in self.plan.around(window):
             if near is window:
                 continue
             reduced = self._reduced(near)
@@ -123,6 +119,7 @@ class Batches:
         plan, configuration = self.plan, self.work.settings.configuration
         return BatchTask(
             origin=self.work.origin,
+            run=str(self.work.run),
             url=plan.url,
             identity=plan.archive.identity,
             name=plan.name,
@@ -155,7 +152,7 @@ class Batches:
         self.transient |= outcome.transient
         if outcome.transient or not outcome.lasting:
             self._unstable.add(window.index)
-        if not any(near.index in self._unstable for near in self._around(window)):
+        if not any(near.index in self._unstable for near in self.plan.around(window)):
             work.catalog.scratch.save(plan.result_key(window), result)
         self.done[window.index] = result
         if result.reason:

@@ -38,7 +38,8 @@ def _settings() -> dict[str, Any]:
     }
 
 
-def _cores() -> int:
+def cores() -> int:
+    """Cores of this machine that this process may use."""
     # Not every core may be ours; macOS does not tell.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -122,7 +123,7 @@ def connect(run: RunParameters) -> Iterator[Client]:
     for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
-    threads = run.threads or _cores()
+    threads = run.threads or cores()
     with ExitStack() as made, dask.config.set(_settings()):
         if run.scheduler is None and run.jobs is None:
             client = Client(

@@ -8,6 +8,7 @@ same command goes on where it was.
 from __future__ import annotations
 
 import logging
+import os
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -264,6 +265,7 @@ def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
         strong=strong_scintillation.from_responses(
             responses, plan.geometry, plan.grid, work.settings.configuration.response.sampling
         ),
+        surroundings=plan.surroundings,
     )
 
 
@@ -351,7 +353,7 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     header = plan.header
     dataset = assemble(
         results,
-        description.describe(model_of(plan, work), header),
+        description.describe(model_of(plan, work), header) | surroundings.compared(results),
         campaign=header.campaign,
         archive=header.archive,
         archive_identity=plan.archive.identity,
@@ -361,7 +363,7 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
         scintillometers=[scintillometer.name for scintillometer in header.scintillometers],
         attributes=attributes_of(plan, work.settings),
     )
-    published = catalog.publish(dataset, work.run, url=plan.url, header=plan.archive.attributes, replace=again)
+    published = catalog.publish(dataset, work.run, url=lasting(plan.url), header=plan.archive.attributes, replace=again)
     catalog.scratch.remove(plan.result_key(window) for window in plan.windows)
     return ArchiveOutcome(
         plan.url,
@@ -372,6 +374,11 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
         input_fault=bool(faults),
         **counts,
     )
+
+
+def lasting(url: str) -> str:
+    """The URL, or the path as it is from any folder."""
+    return url if "://" in url or "::" in url else os.path.abspath(url)
 
 
 def attributes_of(plan: ArchivePlan, settings: Settings) -> dict[str, Any]:

@@ -14,11 +14,13 @@ from ..pipeline.lineage import Key, checkout, make_key
 from ..pipeline.parameters import SOURCES_USED
 from ..pipeline.units import safe
 from .settings import InputError
+from .surroundings import surroundings_of, with_heights
 
 if TYPE_CHECKING:
     from ..catalog.archive import Archive
     from ..pipeline.geometry import Geometry, SliceGrid
     from ..pipeline.parameters import BatchParameters, Header
+    from ..pipeline.surroundings import Surroundings
     from ..plugins.contract import (
         HyperparameterSelectorBase,
         RegulariserBase,
@@ -73,6 +75,8 @@ class ArchivePlan:
         Batches.
     measured_key, reduction_key, response_key, profile_key : Key
         Identity of slopes and fluxes, of the correlations, of the response matrix, and of the product.
+    surroundings : Surroundings or None
+        Weather, heights and other instruments, where the campaign tells of them.
     """
 
     url: str
@@ -90,6 +94,7 @@ class ArchivePlan:
     reduction_key: Key
     response_key: Key
     profile_key: Key
+    surroundings: Surroundings | None = None
 
     @property
     def name(self) -> str:
@@ -100,6 +105,10 @@ class ArchivePlan:
     def reach(self) -> int:
         """How many batches before and after each one the selector looks at."""
         return int(getattr(self.selector, "neighbours", 0))
+
+    def around(self, window: BatchWindow) -> tuple[BatchWindow, ...]:
+        """A batch and those around it that the selector looks at."""
+        return self.windows[max(0, window.index - self.reach) : window.index + self.reach + 1]
 
     def measurement_key(self, window: BatchWindow) -> Key:
         """Identity of the slopes and fluxes of one batch."""
@@ -183,6 +192,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
                 f"'{settings.campaign}'; leave this archive out, or process it under a campaign file of its own"
             ]
         )
+    header = with_heights(header, settings)
     configuration = settings.configuration
     geometry = header.geometry()
     used = SOURCES_USED[configuration.correlation.sources][: geometry.n_sources]
@@ -241,10 +251,16 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         plugins={"sources": [source.identity() for source in sources], "spectrum": spectrum.identity()},
         mark=mark,
     )
+    windows = tuple(batch_windows(archive.time, instrument.frame_rate, configuration.batch))
+    surroundings = surroundings_of(header, grid, settings, windows[0].start_time, windows[-1].stop_time)
     profile = make_key(
         "profile",
         stages.RETRIEVE_VERSION,
-        tracked={**configuration.inversion.model_dump(), **description.tracked(header)},
+        tracked={
+            **configuration.inversion.model_dump(),
+            **description.tracked(header),
+            **({} if surroundings is None else {"surroundings": surroundings.tracked()}),
+        },
         plugins={"regulariser": regulariser.identity(), "selector": selector.identity()},
         upstream=[reduction, responses],
         mark=mark,
@@ -260,9 +276,10 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         spectrum=spectrum,
         regulariser=regulariser,
         selector=selector,
-        windows=tuple(batch_windows(archive.time, instrument.frame_rate, configuration.batch)),
+        windows=windows,
         measured_key=measured,
         reduction_key=reduction,
         response_key=responses,
         profile_key=profile,
+        surroundings=surroundings,
     )

@@ -119,7 +119,7 @@ class Bar(Lines):
 
 
 @contextmanager
-def progress(total: int, quiet: bool = False) -> Iterator[Progress]:
+def progress(total: int, quiet: bool = False, silent: bool = False) -> Iterator[Progress]:
     """Bars on a terminal, lines elsewhere, and one line at the end with the time it took.
 
     Parameters
@@ -128,10 +128,12 @@ def progress(total: int, quiet: bool = False) -> Iterator[Progress]:
         Number of archives.
     quiet : bool
         Only what went wrong.
+    silent : bool
+        Nothing: log records say it.
     """
     begin = time.monotonic()
-    if quiet:
-        yield _Faults(total)
+    if quiet or silent:
+        yield _Nothing(total) if silent else _Faults(total)
         return
     watcher: Lines
     if not sys.stderr.isatty():
@@ -160,3 +162,16 @@ class _Faults(Lines):
         """Speak of failures."""
         for fault in outcome.faults:
             self._say(fault)
+
+
+class _Nothing(Lines):
+    """Nothing at all."""
+
+    def _say(self, fault: str) -> None:
+        """Say nothing."""
+
+    def warned(self, message: str) -> None:
+        """Say nothing."""
+
+    def finished(self, outcome: ArchiveOutcome) -> None:
+        """Say nothing."""

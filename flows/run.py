@@ -96,7 +96,7 @@ def session(settings: Settings, progress: Progress | None = None, options: Optio
         work = Work(settings, catalog, identity, client, pulse, options or Options())
         try:
             with pulse, logs.about(run=identity):
-                log.info("%d archives on %d threads into %s", len(settings.archives), threads, settings.output)
+                log.info("archives: %d, threads: %d, catalog: %s", len(settings.archives), threads, settings.output)
                 yield work
         except BaseException as error:
             work.stopping.set()

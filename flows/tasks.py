@@ -81,6 +81,8 @@ class BatchTask:
     ----------
     origin : Origin
         Who asks.
+    run : str
+        In which run.
     url, identity, name : str
         The archive, what it was when the run was planned, and what people call it.
     window : BatchWindow
@@ -108,6 +110,7 @@ class BatchTask:
     """
 
     origin: Origin
+    run: str
     url: str
     identity: str
     name: str
@@ -250,15 +253,16 @@ def process_batch(task: BatchTask, model: Model | None) -> BatchOutcome:
     Never raises: what the data forbid becomes a failed result with its reason, and so does what goes wrong with the
     machine, which another try may mend. Exceptions do not travel: not all can, and one that cannot hangs the run.
     """
+    place = {"run": task.run, "archive": task.name, "batch": task.window.index}
     if not task.origin.elsewhere:
-        with logs.about(archive=task.name, batch=task.window.index):
+        with logs.about(**place):
             return _process(task, model)
     worker = _address()
     # Workers that join while a run is under way are seen by nobody before their first batch.
     if wrong := differences(versions(), task.origin.versions, worker):
         return BatchOutcome(task.window, None, refused="; ".join(wrong), worker=worker)
     one_thread()
-    with logs.collected(task.origin.level) as records, logs.about(archive=task.name, batch=task.window.index):
+    with logs.collected(task.origin.level) as records, logs.about(**place):
         outcome = _process(task, model)
     return replace(outcome, worker=worker, records=tuple(records))
 

@@ -10,6 +10,7 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from ..driver import Options
     from ..settings import Settings
 
 
@@ -64,46 +65,66 @@ def settings_of(
     return settings
 
 
-@click.command()
-@_inputs
-def plan(
-    inputs: tuple[str, ...], out: Path | None, sampling: str | None, slices: int | None, assignments: tuple[str, ...]
-) -> None:
-    """Show what a run would read, compute and reuse; nothing is computed and nothing written."""
+def _chosen(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options that choose among archives and batches; no number depends on them."""
+    for decorate in (
+        click.option("--retry-failed", is_flag=True, help="Also compute again what failed in products that are there."),
+        click.option("--since", metavar="TIME", help="Only archives with frames at TIME (2012-09-14T14:00Z) or later."),
+        click.option("--until", metavar="TIME", help="Only archives with frames before TIME."),
+    ):
+        command = decorate(command)
+    return command
+
+
+def options_of(since: str | None, until: str | None, retry_failed: bool, keep_going: bool = True) -> Options:
+    """Options of a command line."""
+    from ...catalog.query_times import TimeError, moment
+    from ..driver import Options
+    from ..settings import InputError
+
+    times: list[int | None] = []
+    faults = []
+    for option, value in (("--since", since), ("--until", until)):
+        try:
+            times.append(None if value is None else moment(value))
+        except TimeError as error:
+            faults.append(f"{option}: {error}")
+    if not faults and None not in times and times[0] >= times[1]:  # type: ignore[operator]
+        faults.append(f"--since {since} --until {until}: nothing lies between them; --since must be the earlier one")
+    if faults:
+        raise InputError(faults)
+    return Options(retry_failed=retry_failed, keep_going=keep_going, since=times[0], until=times[1])
+
+
+def show_plan(settings: Settings, options: Options) -> None:
+    """Say what a run would reuse, read, compute and write, and how long that may take."""
     from ...catalog.archive import ArchiveError
     from ...catalog.database import is_catalog
     from ...pipeline.units import safe
+    from ...plugins.registry import PluginError
     from ..cli import complain
-    from ..driver import kept_correlations
+    from ..estimate import forecast, lines
     from ..plan import plan_archive
-    from ..progress import counted
     from ..settings import InputError
     from .results import existing
 
-    settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
     faults: list[str] = []
-    frames = computed = 0
+    found, skipped = [], 0
     catalog = existing(settings.output) if is_catalog(settings.output) else None
-    kept = kept_correlations(settings.output.absolute())
     for url in settings.archives:
         try:
             planned = plan_archive(url, settings)
-        except (ArchiveError, InputError) as error:
+        except (ArchiveError, InputError, PluginError) as error:
             faults += error.faults
             continue
-        if catalog is not None and catalog.has(planned.archive.identity, planned.profile_key):
-            click.echo(f"{safe(planned.name)}: {counted(len(planned.windows), 'batch')}, in the catalog already")
-            continue
-        new = [window for window in planned.windows if not kept.has(planned.correlation_key(window))]
-        read = sum(window.stop - window.start for window in new)
-        frames += read
-        computed += len(planned.windows)
-        click.echo(
-            f"{safe(planned.name)}: {counted(len(planned.windows), 'batch')} to compute, "
-            f"{len(planned.windows) - len(new)} from kept correlations, {counted(read, 'frame')} to read  "
-            f"(key {str(planned.profile_key)[:16]})"
-        )
-    click.echo(f"in all {counted(computed, 'batch')} to compute, {counted(frames, 'frame')} to read")
+        if options.wants(planned):
+            found.append(forecast(planned, settings, catalog, options))
+        else:
+            skipped += 1
+    for line in lines(found, settings, catalog):
+        click.echo(safe(line))
+    if skipped:
+        click.echo(f"{skipped} of {len(settings.archives)} archives lie outside the range of time")
     if faults:
         complain(faults)
         raise click.exceptions.Exit(2)
@@ -111,8 +132,35 @@ def plan(
 
 @click.command()
 @_inputs
+@_chosen
+def plan(
+    inputs: tuple[str, ...],
+    out: Path | None,
+    sampling: str | None,
+    slices: int | None,
+    assignments: tuple[str, ...],
+    since: str | None,
+    until: str | None,
+    retry_failed: bool,
+) -> None:
+    """Show what a run would reuse, read, compute and write, and about how long that takes; nothing is computed."""
+    settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
+    show_plan(settings, options_of(since, until, retry_failed))
+
+
+@click.command()
+@_inputs
+@_chosen
 @click.option("--scheduler", metavar="ADDRESS|FILE", help="Dask cluster to compute on; this machine without.")
 @click.option("--no-prefect", is_flag=True, help="Without the Prefect server: the same results, a quicker start.")
+@click.option("--dry-run", is_flag=True, help="Only say what would be done, as 'coslidar plan' does.")
+@click.option(
+    "--keep-going/--no-keep-going", default=True, show_default=True, help="Begin other archives after one has failed."
+)
+@click.option("--log-json", is_flag=True, help="One JSON object a line on stderr instead of progress.")
+@click.option(
+    "--log-level", type=click.Choice(["debug", "info", "warning"]), help="Log records on stderr instead of progress."
+)
 @click.option("-q", "--quiet", is_flag=True, help="Say only what went wrong.")
 def run(
     inputs: tuple[str, ...],
@@ -120,8 +168,15 @@ def run(
     sampling: str | None,
     slices: int | None,
     assignments: tuple[str, ...],
+    since: str | None,
+    until: str | None,
+    retry_failed: bool,
     scheduler: str | None,
     no_prefect: bool,
+    dry_run: bool,
+    keep_going: bool,
+    log_json: bool,
+    log_level: str | None,
     quiet: bool,
 ) -> None:
     """Turn recordings into catalogued Cn2 profiles.
@@ -130,11 +185,18 @@ def run(
     computed again; a run that was interrupted goes on where it was. One bad archive or batch does not stop the others.
     """
     from ..progress import counted, progress
-    from ..run import run as process
 
     settings = settings_of(inputs, out, assignments, scheduler, sampling=sampling, slices=slices)
-    with progress(len(settings.archives), quiet) as watcher:
-        outcomes = process(settings, watcher, prefect=not no_prefect)
+    options = options_of(since, until, retry_failed, keep_going)
+    if dry_run:
+        show_plan(settings, options)
+        return
+    from .. import logs
+    from ..run import run as process
+
+    logged = log_json or log_level is not None
+    with logs.shown(log_level, log_json), progress(len(settings.archives), quiet, silent=logged) as watcher:
+        outcomes = process(settings, watcher, prefect=not no_prefect, options=options)
     published = [outcome for outcome in outcomes if outcome.status in ("published", "present")]
     if not quiet and published:
         verb = "is" if len(published) == 1 else "are"
