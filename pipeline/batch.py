@@ -45,11 +45,12 @@ if TYPE_CHECKING:
         InversionParameters,
     )
     from .protocols import HyperparameterSelector, Regulariser
+    from .surroundings import Surroundings
 
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 3
-RESPONSE_VERSION = 1
+RESPONSE_VERSION = 2
 RETRIEVE_VERSION = 5
 
 #: Fewer frames than this make no correlation worth the name.
@@ -106,6 +107,8 @@ class Model:
         Weight of each slice in the Cn2 of each scintillometer on the path; n = 0 without any.
     strong : StrongScintillation, optional
         Correction of the scintillation response; first order where it is absent.
+    surroundings : Surroundings, optional
+        What is known of air and ground around the path.
     """
 
     geometry: Geometry
@@ -117,6 +120,7 @@ class Model:
     inversion: InversionParameters
     scintillometers: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
     strong: strong_scintillation.StrongScintillation | None = None
+    surroundings: Surroundings | None = None
 
 
 def measure(
@@ -461,6 +465,18 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         averages = [partial(turbulence.path_average, weights=weights) for weights in model.scintillometers]
         values["cn2_path_average"] = np.array([average(profile.cn2) for average in averages])
         values["cn2_path_average_interval_68"] = np.stack([interval(average) for average in averages])
+    draws = None if profile.posterior is None else profile.posterior.draws
+    # Who compares the product with an instrument that was not known here carries the errors with this.
+    values["cn2_posterior_covariance"] = (
+        np.full((grid.k, grid.k), np.nan) if draws is None else np.atleast_2d(np.cov(draws, rowvar=False))
+    )
+    if len(model.scintillometers):
+        shares = model.scintillometers / model.scintillometers.sum(axis=1, keepdims=True)
+        values["cn2_path_average_standard_error"] = np.sqrt(
+            np.einsum("ik,kl,il->i", shares, values["cn2_posterior_covariance"], shares)
+        )
+    if model.surroundings is not None:
+        values |= model.surroundings.derive(profile.cn2, draws, reduced.start, reduced.stop)
     # Checks that were made with the correlations.
     values |= {name: value for name, value in arrays.items() if name in SCHEMA and name not in values}
     negative = any(

@@ -65,9 +65,9 @@ _NODES_PER_RADIAN = 0.36
 _SHELL_RATIO = math.sqrt(2.0)
 _MAX_SHELLS = 90
 _MAX_PANELS = 200
-#: Turns of the diffraction fringe within a slice above which its mean is left out (below 1e-4 of the scintillation
-#: cross map of a point source; a source of a few cm blurs the fringe away).
-_FRINGE_TURNS = 20
+#: Turns of the diffraction fringe within a slice above which its mean is taken from the ends of the slice. A source of
+#: a few cm blurs the fringe away.
+_FRINGE_TURNS = 16
 #: Phase in radians over which a fringe is long work to follow.
 _LONG = 3000.0
 _CHUNK = 2048
@@ -315,6 +315,8 @@ def _slice_integral(model: _Model, z0: float, z1: float) -> Array:
         a, b, maps, _ = done.pop(int(np.argmax(errors.max(axis=1))))
         total = total - maps
         waiting = [(a, (a + b) / 2), ((a + b) / 2, b)]
+    if effort.without_fringe:
+        total = total + _fringe_at(model, z1, effort) - _fringe_at(model, z0, effort)
     if model.geometry.n_sources == 1:
         total[list(_CROSS)] = np.nan
     return total
@@ -445,6 +447,43 @@ def _turns_of_fringe(model: _Model, z: float) -> float:
         return math.inf
     reach = math.hypot(*geometry.separation) * geometry.magnification(z)
     return reach**2 / (4 * model.band.centre * z * geometry.scaling(z)) if z else 0.0
+
+
+def _fringe_at(model: _Model, z: float, effort: _Effort) -> Array:
+    """What the end z of a slice adds to the integral of the fringe over it, (6, 2p - 1, 2q - 1).
+
+    At the separation d the fringe is Re[A exp(i phi)], A slow and phi = pi (m s - d)^2 / (2 lambda z L / (L - z)).
+    With phi as variable and H = A / phi', its integral is Re[(-i H + dH/dphi) exp(i phi)] between the ends, by parts
+    twice. Four layers within three quarters of a turn tell H and its derivative.
+    """
+    geometry = model.geometry
+    maps = np.zeros((6, *geometry.map_shape))
+    if z == geometry.path_length:
+        return maps  # infinitely quick there
+    sx, sy = geometry.separation
+    dx, dy = np.moveaxis(geometry.lags * geometry.subaperture_size, -1, 0)
+
+    def phase(at: float) -> Array:
+        m = geometry.magnification(at)
+        squared = (m * sx - dx) ** 2 + (m * sy - dy) ** 2
+        return np.asarray(np.pi * squared / (2 * model.band.centre * at * geometry.scaling(at)))
+
+    def speed(at: float) -> Array:
+        return np.asarray((phase(at + 1e-5 * z) - phase(at - 1e-5 * z)) / (2e-5 * z))
+
+    whole = replace(effort, lowest=1.4 * _fringe_frequency(model, model.band.limits[0]), without_fringe=False)
+    quarter = np.pi / 4 / float(speed(z).mean())
+    unknowns, values = [], []
+    for layer in z + quarter * np.array([-3.0, -1.0, 1.0, 3.0]):
+        fringe = _one_layer(model, layer, whole) - _one_layer(model, layer, effort)
+        u = phase(layer) - phase(z)
+        unknowns.append([np.cos(u), u * np.cos(u), -np.sin(u), -u * np.sin(u)])
+        values.append(fringe[list(_CROSS)] / speed(layer))
+    # (dy, dx, layers, unknowns): real parts of H exp(i phi) and of its derivative, then imaginary parts.
+    system = np.moveaxis(np.array(unknowns), (0, 1), (2, 3))
+    found = np.linalg.solve(system, np.moveaxis(np.array(values), (0, 1), (2, 3)))
+    maps[list(_CROSS)] = np.moveaxis(found[:, :, 1] + found[:, :, 2], -1, 0)
+    return maps
 
 
 def _effort(model: _Model, z0: float, z1: float) -> tuple[_Effort, Array | None]:

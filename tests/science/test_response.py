@@ -402,6 +402,35 @@ def test_point_sources_and_a_shift_of_18_m() -> None:
     test_point_sources_scintillate_as_in_closed_form(2558.75)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "turns"), [(8, 18), (9, 32), (10, 95)])
+def test_slice_means_of_point_sources_in_closed_form(number: int, turns: int) -> None:
+    """The fringe of two points turns many times in these slices, and is taken from their ends.
+
+    The closed form of a layer, over Gauss-Legendre panels in m = z / (L - z), in which the fringe turns evenly: eight
+    nodes a turn are good to 1e-9.
+    """
+    d, length = SCINDAR.subaperture_size, SCINDAR.path_length
+    nodes, rule = np.polynomial.legendre.leggauss(24)
+    offset = np.concatenate([-(nodes + 1) / 2, (nodes + 1) / 2]) * d
+    triangle = np.concatenate([rule, rule]) / 2 * (1 - np.abs(offset) / d)
+    z0, z1 = length * number / 12, length * (number + 1) / 12
+    edges = np.linspace(z0 / (length - z0), z1 / (length - z1), math.ceil(turns / 2.5) + 1)
+    lags = [(0, 0), (0, 3), (2, 4)]
+    expected = np.zeros(3)
+    nodes, rule = np.polynomial.legendre.leggauss(20)
+    for a, b in pairwise(edges):
+        for m, weight in zip((a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * rule, strict=True):
+            z = length * m / (1 + m)
+            for place, (dx, dy) in enumerate(lags):
+                r = np.hypot(dx * d + offset, (dy * d - 0.8 * m + offset)[:, None])
+                layer = triangle @ point_scintillation(r, z, SCINDAR) @ triangle
+                expected[place] += weight * length / (1 + m) ** 2 * layer
+    matrix = response_matrix(SCINDAR, SliceGrid((z0, z1)), KOLMOGOROV, [Point()] * 2)
+    maps = matrix[:, 0].reshape(6, 9, 9)
+    assert np.abs(picked(maps, SCINDAR, lags)[5] - expected).max() < PROMISE * np.abs(maps[5]).max()
+
+
 @pytest.mark.parametrize("length", [2670.0, math.inf])
 def test_scintillation_of_a_vanishing_aperture_is_the_rytov_index(length: float) -> None:
     # 4 k^2 integral of S_n sin^2: 2.25 k^(7/6) [z (1 - z / L)]^(5/6), plane and spherical. The aperture of 10 um
