@@ -6,7 +6,7 @@ import math
 import sqlite3
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,48 @@ def network_file_system(path: Path, mounts: Path = Path("/proc/self/mountinfo"))
     return found if found.removeprefix("fuse.") in NETWORK_FILE_SYSTEMS else None
 
 
+def remember(root: Path, url: str) -> None:
+    """Note in the folder of a catalog which database it has.
+
+    Raises
+    ------
+    DatabaseError
+        The URL holds a password, which everybody who sees the folder could read, or the file cannot be written.
+    """
+    read = database_url(url)
+    if read.password is not None:
+        raise DatabaseError(
+            "the URL holds a password, and the folder of a catalog is no place for it; leave it out, and put it into "
+            "~/.pgpass or PGPASSWORD"
+        )
+    try:
+        (root / URL_FILE).write_text(read.render_as_string() + "\n", encoding="utf-8")
+    except OSError as error:
+        raise DatabaseError(f"{safe(str(root / URL_FILE))}: the file cannot be written: {error.strerror}") from error
+
+
+def keep_copy(url: URL) -> Path | None:
+    """Copy an SQLite database to a file beside it; None where it is none.
+
+    Raises
+    ------
+    DatabaseError
+        It cannot be copied.
+    """
+    if url.get_backend_name() != "sqlite" or not url.database:
+        return None
+    file = Path(url.database)
+    copy = file.with_name(f"{file.name}.{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}")
+    try:
+        with closing(sqlite3.connect(file, timeout=BUSY_TIMEOUT)) as source, closing(sqlite3.connect(copy)) as target:
+            source.backup(target)
+    except sqlite3.Error as error:
+        raise DatabaseError(
+            f"{safe(str(copy))}: the catalog could not be copied before its upgrade: {error}"
+        ) from error
+    return copy
+
+
 class Database:
     """Connection to the tables of a catalog.
 
@@ -260,7 +302,7 @@ class Database:
         elif version < SCHEMA_VERSION:
             raise OldTables(
                 f"{self.name}: the catalog has tables of version {version}, this coslidar works with "
-                f"{SCHEMA_VERSION}; 'coslidar catalog upgrade' brings them up to date"
+                f"{SCHEMA_VERSION}; 'coslidar catalog upgrade --out FOLDER' brings them up to date"
             )
 
     def _upgrade(self) -> None:
@@ -286,6 +328,14 @@ class Database:
     def read(self) -> Iterator[Connection]:
         """A transaction that changes nothing."""
         with self.engine.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def snapshot(self) -> Iterator[Connection]:
+        """A transaction that changes nothing and sees the same, however often it looks and whoever writes."""
+        # SQLite's own transactions are so; on PostgreSQL every statement sees the newest rows unless told otherwise.
+        options = {} if self.is_sqlite else {"isolation_level": "REPEATABLE READ"}
+        with self.engine.connect().execution_options(**options) as connection, connection.begin():
             yield connection
 
     @contextmanager

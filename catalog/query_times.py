@@ -107,9 +107,10 @@ def _in_zone(wall: datetime, name: str, fixed: timezone | None) -> datetime:
     return shown[0]
 
 
-def utc_text(nanoseconds: int) -> str:
-    """A moment as ISO 8601 in UTC, to the second."""
-    return f"{_at(nanoseconds):%Y-%m-%dT%H:%M:%S}Z"
+def utc_text(nanoseconds: int, *, exact: bool = False) -> str:
+    """A moment as ISO 8601 in UTC, to the second or exactly."""
+    fraction = f".{nanoseconds % 10**9:09d}".rstrip("0").rstrip(".") if exact else ""
+    return f"{_at(nanoseconds):%Y-%m-%dT%H:%M:%S}{fraction}Z"
 
 
 def local_text(nanoseconds: int, name: str | None) -> str:

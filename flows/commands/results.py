@@ -1,16 +1,16 @@
-"""Commands for what has been computed: catalog and report."""
+"""Commands for what has been computed."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 if TYPE_CHECKING:
     from ...catalog.store import Catalog, ProductRow
 
-_OUT = click.option(
+OUT = click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
     default=Path("results"),
@@ -34,7 +34,8 @@ def existing(folder: Path, *, read_only: bool = False) -> Catalog:
         raise InputError([str(error)]) from error
 
 
-def _find(catalog: Catalog, text: str) -> ProductRow:
+def find(catalog: Catalog, text: str) -> ProductRow:
+    """The product that a person means."""
     from ...catalog.store import CatalogError
     from ..settings import InputError
 
@@ -44,80 +45,80 @@ def _find(catalog: Catalog, text: str) -> ProductRow:
         raise InputError([str(error)]) from error
 
 
-def _time(nanoseconds: int) -> str:
-    import numpy as np
-
-    return f"{np.datetime64(nanoseconds, 'ns').astype('datetime64[s]')}Z"
-
-
 @click.group()
 def catalog() -> None:
-    """List, show, export and check products."""
+    """List, find, compare, cite and keep products.
+
+    \b
+    coslidar catalog ls                                   what there is
+    coslidar catalog query 'quality=good r0>10 cm'        batches by what came out of them
+    coslidar catalog diff demo/r0.78128ac8 demo/r0.dd832e33
+    coslidar catalog promote demo/r0.78128ac8             the product that counts for its recording
+    coslidar catalog alias paper-v1 --query 'current=yes campaign=demo'
+    coslidar catalog backup /media/disk/results           and 'verify' of it from time to time
+    """  # noqa: D301
 
 
 @catalog.command("ls")
-@_OUT
+@OUT
 @click.option("--campaign", help="Only this campaign.")
 @click.option("--batches", is_flag=True, help="One line per batch instead of one per product.")
 def catalog_ls(out: Path, campaign: str | None, batches: bool) -> None:
-    """List products, or their batches."""
+    """List products, or their batches, with their local times; * marks accepted products.
+
+    'coslidar catalog query' chooses batches by their numbers.
+    """
+    from ...catalog import listing
+    from ...catalog.query_times import local_text, utc_text
     from ..progress import counted
 
     with existing(out) as opened:
-        if not batches:
-            rows = opened.products(campaign_name=campaign)
-            click.echo(f"{'product':<44} {'start (UTC)':<20} {'batches':>7}  file")
-            for row in rows:
-                click.echo(f"{row.name:<44} {_time(row.start):<20} {row.batches:>7}  {row.path}")
-            click.echo(f"{counted(len(rows), 'product')} in {out}")
+        if batches:
+            click.echo(listing.table(opened.batches(campaign_name=campaign)), nl=False)
             return
-        found = opened.batches(campaign_name=campaign)
+        rows = opened.products(campaign_name=campaign)
+    click.echo(f"{'product':<44}   {'start (UTC)':<20}  {'local time':<25} {'batches':>7}  file")
+    for row in rows:
+        mark = "*" if row.accepted is not None else " "
         click.echo(
-            f"{'start (UTC)':<20} {'archive':<24} {'frames':>7} {'r0 (m)':>8} {'scint.':>8} {'profile':>8} "
-            f"{'log mu':>6} {'chi2':>6} quality"
+            f"{row.name:<44} {mark} {utc_text(row.start):<20}  {local_text(row.start, row.timezone) or '-':<25} "
+            f"{row.batches:>7}  {row.path}"
         )
-        words = ("good", "usable", "bad")
-
-        def number(value: float | None, form: str) -> str:
-            return "-" if value is None else format(value, form)
-
-        from math import log10
-
-        for batch in found:
-            click.echo(
-                f"{_time(batch.start):<20} {batch.archive:<24} {number(batch.n_frames, 'd'):>7} "
-                f"{number(batch.r0, '.4f'):>8} {number(batch.scintillation_index, '.4f'):>8} "
-                f"{number(batch.scintillation_index_profile, '.4f'):>8} "
-                f"{number(log10(batch.mu) if batch.mu else None, '.2f'):>6} {number(batch.chi2, '.2f'):>6} "
-                f"{words[batch.quality_level]}"
-            )
+    click.echo(f"{counted(len(rows), 'product')} in {out}")
 
 
 @catalog.command("runs")
-@_OUT
+@OUT
 @click.option("--failures", is_flag=True, help="Also every archive and batch that failed in each, and why.")
 def catalog_runs(out: Path, failures: bool) -> None:
     """List runs: when each began, how it ended, what failed in it."""
+    from ...catalog.query_times import utc_text
+    from ...pipeline.units import safe
+
     with existing(out) as opened:
-        click.echo(f"{'start (UTC)':<20} {'state':<12} {'failures':>8}  command")
-        for made in opened.runs():
-            failed = opened.failures(made.id)
-            click.echo(f"{_time(made.started):<20} {made.state:<12} {len(failed):>8}  {made.command}")
-            for failure in failed if failures else ():
-                what = failure.archive if failure.start is None else f"{failure.archive} at {_time(failure.start)}"
-                click.echo(f"    {what}: {failure.reason.removeprefix(failure.archive + ': ')}")
+        runs, failed = opened.runs(), opened.failures()
+    click.echo(f"{'start (UTC)':<20} {'state':<12} {'failures':>8}  command")
+    for made in runs:
+        mine = [failure for failure in failed if failure.run == made.id]
+        click.echo(f"{utc_text(made.started):<20} {made.state:<12} {len(mine):>8}  {safe(made.command)}")
+        for failure in mine if failures else ():
+            what = failure.archive if failure.start is None else f"{failure.archive} at {utc_text(failure.start)}"
+            click.echo(f"    {safe(what)}: {safe(failure.reason.removeprefix(failure.archive + ': '))}")
 
 
 @catalog.command("show")
 @click.argument("product")
-@_OUT
+@OUT
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 def catalog_show(product: str, out: Path, as_json: bool) -> None:
     """Show a product (its name, the beginning of its key, or its file): profiles, settings, lineage."""
     import json
 
+    from ...catalog.query_times import utc_text
+    from ...pipeline.units import safe
+
     with existing(out) as opened:
-        row = _find(opened, product)
+        row = find(opened, product)
         dataset = opened.open(row)
         if as_json:
             content = {
@@ -135,126 +136,13 @@ def catalog_show(product: str, out: Path, as_json: bool) -> None:
             click.echo(json.dumps(content, indent=1, default=str))
             return
         click.secho(row.name, bold=True)
-        click.echo(f"file      {row.path}\nsha256    {row.sha256}\npublished {_time(row.published)}")
+        click.echo(f"file      {row.path}\nsha256    {row.sha256}\npublished {utc_text(row.published)}")
         for key, value in dataset.attrs.items():
             if key not in ("lineage", "provenance"):
-                click.echo(f"{key:<18} {value}")
+                click.echo(f"{key:<18} {safe(str(value))}")
         click.echo(f"\n{'z (m)':>9} {'Cn2':>10} {'MAP bar':>10}   m^(-2/3), of the first of {row.batches} batches")
         first = dataset.isel(time=0)
         for z, value, bar in zip(
             first["z"].values, first["cn2"].values, first["cn2_standard_error"].values, strict=True
         ):
             click.echo(f"{z:9.1f} {value:10.2e} {bar:10.1e}")
-
-
-@catalog.command("export")
-@click.argument("product")
-@_OUT
-@click.option("--format", "form", type=click.Choice(["csv", "netcdf"]), default="csv", show_default=True)
-@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="File to write.")
-def catalog_export(product: str, out: Path, form: str, output: Path) -> None:
-    """Write a product as CSV (units in a .json beside it) or NetCDF4."""
-    from ...catalog import export
-    from ..settings import InputError
-
-    with existing(out) as opened:
-        dataset = opened.open(_find(opened, product))
-    output.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        if form == "csv":
-            written = export.export_csv([dataset], output)
-        else:
-            written = [export.export_netcdf([dataset], output)]
-    except ImportError as error:
-        raise InputError([str(error)]) from error
-    for path in written:
-        click.echo(path)
-
-
-@catalog.command("verify")
-@_OUT
-@click.option("--fast", is_flag=True, help="Compare sizes, not hashes.")
-def catalog_verify(out: Path, fast: bool) -> None:
-    """Check that every product is what its row says."""
-    with existing(out) as opened:
-        faults = opened.verify(fast=fast)
-        total = len(opened.products())
-    for fault in faults:
-        click.echo(f"coslidar: {fault.row.path}: {fault.reason}", err=True)
-    click.echo(f"{total - len(faults)} of {total} products are sound")
-    if faults:
-        raise click.exceptions.Exit(1)
-
-
-@catalog.command("gc")
-@_OUT
-def catalog_gc(out: Path) -> None:
-    """Remove files that no row knows, as a killed run leaves them."""
-    with existing(out) as opened:
-        removed = opened.collect()
-    click.echo(f"{len(removed)} files removed")
-
-
-@click.command()
-@click.argument("inputs", metavar="CAMPAIGN.toml | PRODUCT | FOLDER", nargs=-1, required=True)
-@click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="Page (.html).")
-@_OUT
-def report(inputs: tuple[str, ...], output: Path, out: Path) -> None:
-    """Draw one self-contained page: profiles with their bars, correlation maps, criterion curves and more.
-
-    Give a campaign file (the newest product of each of its archives), product files, names or keys in the catalog
-    of --out, or the folder of a catalog.
-    """
-    from ...catalog.products import open_product
-    from ...catalog.report import write_report
-    from ..settings import InputError
-
-    datasets: list[Any] = []
-    title = None
-    for item in inputs:
-        path = Path(item)
-        if item.endswith(".toml"):
-            chosen, title = _of_campaign(path)
-            datasets += chosen
-        elif path.is_dir():
-            with existing(path) as opened:
-                datasets += [opened.open(row) for row in _newest(opened.products())]
-        elif path.is_file():
-            datasets.append(open_product(path))
-        else:
-            with existing(out) as opened:
-                datasets.append(opened.open(_find(opened, item)))
-    if not datasets:
-        raise InputError([f"{', '.join(inputs)}: there is no product yet; 'coslidar run' makes them"])
-    output.parent.mkdir(parents=True, exist_ok=True)
-    write_report(datasets, output, title=title)
-    click.echo(f"{output}: {sum(dataset.sizes['time'] for dataset in datasets)} batches. Open it in a browser.")
-
-
-def _newest(rows: list[ProductRow]) -> list[ProductRow]:
-    """The newest product of each archive, in the order of their time."""
-    newest: dict[str, ProductRow] = {}
-    for row in sorted(rows, key=lambda row: row.published):
-        newest[row.archive_identity] = row
-    return sorted(newest.values(), key=lambda row: row.start)
-
-
-def _of_campaign(path: Path) -> tuple[list[Any], str | None]:
-    """Products of a campaign file: those of its settings where they are there, else the newest ones."""
-    from ...catalog.archive import ArchiveError
-    from ..plan import plan_archive
-    from ..settings import InputError, load
-
-    settings = load(path)
-    found = []
-    with existing(settings.output) as opened:
-        rows = opened.products(campaign_name=settings.campaign)
-        for url in settings.archives:
-            try:
-                planned = plan_archive(url, settings)
-            except (ArchiveError, InputError):
-                continue  # 'coslidar run' and 'inspect' say what is wrong with it
-            mine = [row for row in rows if row.archive_identity == planned.archive.identity]
-            exact = [row for row in mine if row.lineage_key == str(planned.profile_key)]
-            found += [opened.open(row) for row in exact or _newest(mine)]
-    return found, settings.campaign

@@ -288,6 +288,9 @@ def test_local_times_are_those_of_the_zone(wall, name):
 
 def test_times_are_shown_beside_each_other():
     assert utc_text(START) == "2012-09-14T12:15:00Z"
+    assert utc_text(START, exact=True) == "2012-09-14T12:15:00.000000123Z"
+    assert utc_text(START - 123 + 5 * 10**8, exact=True) == "2012-09-14T12:15:00.5Z"
+    assert utc_text(START - 123, exact=True) == "2012-09-14T12:15:00Z"
     assert local_text(START, "Europe/Paris") == "2012-09-14T14:15:00+02:00"
     assert local_text(START + 60 * 86400 * 10**9, "Europe/Paris") == "2012-11-13T13:15:00+01:00"
     assert local_text(START, None) == local_text(START, "Mars/Olympus") == ""
