@@ -376,7 +376,7 @@ def _read_mnd(path: Path, origin: str, reading: Reading) -> _Table:
     columns: dict[str, tuple[NDArray[np.float64], str | None]] = {}
     for index, (name, unit) in enumerate(zip(names, units, strict=True)):
         if name in _MND or name in reading.columns.values():
-            columns[name] = (_numbers([record[index] for record in records], name, origin, faults), unit)
+            columns[name] = (numbers_of([record[index] for record in records], name, origin, faults), unit)
     if faults:
         raise SeriesError(faults[:5] + ([f"{origin}: and {len(faults) - 5} more"] if len(faults) > 5 else []))
     return _Table(np.array(start, dtype=np.int64), np.array(stop, dtype=np.int64), columns, _MND, warnings)
@@ -398,7 +398,8 @@ def _mnd_interval(text: str, origin: str, reading: Reading) -> tuple[int, int] |
     return None
 
 
-def _numbers(texts: Sequence[str], name: str, origin: str, faults: list[str]) -> NDArray[np.float64]:
+def numbers_of(texts: Sequence[str], name: str, origin: str, faults: list[str]) -> NDArray[np.float64]:
+    """Numbers of a column of text, NaN where there is none; what is no number is added to `faults`."""
     found = np.full(len(texts), np.nan)
     for number, text in enumerate(texts):
         if text.strip().lower() not in _MISSING:
@@ -428,7 +429,7 @@ def _read_csv(path: Path, origin: str, reading: Reading) -> _Table:
     delimiter = max(",;\t", key=kept[0][1].count)
     heading, *body = csv.reader([line for _, line in kept], delimiter=delimiter)
     # A unit may hold brackets of its own: "Cn2 (m^(-2/3))".
-    parts = [_heading(cell) for cell in heading]
+    parts = [heading_of(cell) for cell in heading]
     names = [name for name, _ in parts]
     times = [index for index, name in enumerate(names) if name.lower() in _TIMES]
     if not times:
@@ -447,7 +448,7 @@ def _read_csv(path: Path, origin: str, reading: Reading) -> _Table:
     columns = {}
     for index, (name, unit) in enumerate(parts):
         if index not in times and _is_wanted(name, reading):
-            columns[name] = (_numbers([row[index] for row in body], name, origin, faults), unit)
+            columns[name] = (numbers_of([row[index] for row in body], name, origin, faults), unit)
         elif index not in times:
             columns[name] = (np.full(len(body), np.nan), unit)
     if faults:
@@ -455,7 +456,8 @@ def _read_csv(path: Path, origin: str, reading: Reading) -> _Table:
     return _Table(start, stop, columns, {})
 
 
-def _heading(cell: str) -> tuple[str, str | None]:
+def heading_of(cell: str) -> tuple[str, str | None]:
+    """Name and unit of a column headed `name [unit]` or `name (unit)`."""
     match = _HEADING.match(cell)
     assert match is not None  # the pattern matches anything
     unit = match[2] if match[2] is not None else match[3]

@@ -19,7 +19,7 @@ from ..catalog.archive import ArchiveError
 from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
-from ..pipeline import description, strong_scintillation
+from ..pipeline import description, strong_scintillation, surroundings
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from . import logs

@@ -53,6 +53,7 @@ def described(settings: Settings) -> dict[str, Any]:
         "header": settings.header,
         "run": settings.run.model_dump(mode="json"),
         "keep": list(settings.keep),
+        "surroundings": settings.surroundings.model_dump(mode="json"),
         "folder": os.getcwd(),
     }
 

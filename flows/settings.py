@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import ValidationError
 
 from ..pipeline.parameters import Configuration, Header, Name, Parameters, overlay
+from ..pipeline.surroundings import SurroundingsParameters
 from ..pipeline.units import faults as sentences
 from ..pipeline.units import safe, text
 from ..plugins.registry import KEYS, PluginError, create, get
@@ -64,7 +65,7 @@ PRESETS: dict[str, dict[str, Any]] = {
 #: What `keep` of a campaign file may name.
 KEPT = ("measurements",)
 #: Tables of a campaign file that replace or complete keys of the archives' headers.
-HEADER_TABLES = ("site", "instrument", "path", "sources")
+HEADER_TABLES = ("site", "instrument", "path", "sources", "scintillometers")
 _URL = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+://")
 
 
@@ -114,6 +115,10 @@ class Settings:
         Where to compute.
     keep : tuple of str
         Intermediate results that are kept beside the correlations: ``measurements``. No key depends on it.
+    surroundings : SurroundingsParameters
+        Weather and terrain.
+    folder : pathlib.Path
+        Where relative paths of series and terrain begin.
     """
 
     origin: str
@@ -125,6 +130,8 @@ class Settings:
     header: dict[str, Any] = field(default_factory=dict)
     run: RunParameters = field(default_factory=RunParameters)
     keep: tuple[str, ...] = ()
+    surroundings: SurroundingsParameters = field(default_factory=SurroundingsParameters)
+    folder: Path = Path()
 
     @property
     def keeps_measurements(self) -> bool:
@@ -333,6 +340,12 @@ def load(
     header = {key: table.pop(key) for key in HEADER_TABLES if key in table}
     if header:
         faults += [fault for fault in _header_faults(header, origin) if fault not in faults]
+    around = {key: table.pop(key) for key in SurroundingsParameters.model_fields if key in table}
+    try:
+        surroundings = SurroundingsParameters.model_validate(around)
+    except ValidationError as error:
+        faults += sentences(error, origin)
+        surroundings = SurroundingsParameters()
     plugins = {key: dict(value) for key, value in DEFAULT_PLUGINS.items()}
     for key in KEYS:
         if key in table:
@@ -371,6 +384,8 @@ def load(
         header=header,
         run=run,
         keep=tuple(keep),
+        surroundings=surroundings,
+        folder=folder,
     )
 
 
@@ -428,7 +443,8 @@ def _header_faults(header: dict[str, Any], origin: str) -> list[str]:
         return [
             sentence
             for sentence, fault in zip(sentences(error, origin), error.errors(include_url=False), strict=True)
-            if fault["type"] != "missing"
+            # Scintillometers are a list: what the campaign says of one is all there is.
+            if fault["type"] != "missing" or fault["loc"][0] == "scintillometers"
         ]
     return []
 

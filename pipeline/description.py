@@ -9,6 +9,8 @@ import numpy as np
 from . import turbulence, vibration
 from .geometry import MAP_KINDS
 from .products import INTENSITY_KINDS, SLOPE_KINDS
+from .scintillometer import slice_weights
+from .surface_layer import effective_height
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +26,9 @@ def tracked(header: Header) -> dict[str, Any]:
     """What of a header enters a product beside geometry and detector."""
     return {
         "heights": header.path.heights,
-        "scintillometers": [(s.name, s.wavelength, s.diameters) for s in header.scintillometers],
+        "scintillometers": [
+            (s.name, s.wavelength, s.diameters, *s.ends(header.path.length)) for s in header.scintillometers
+        ],
     }
 
 
@@ -34,9 +38,7 @@ def scintillometer_weights(header: Header, grid: SliceGrid, sampling: turbulence
         return np.empty((0, grid.k))
     return np.stack(
         [
-            turbulence.scintillometer_weights(
-                grid, other.wavelength, header.path.length, *other.diameters, sampling=sampling
-            )
+            slice_weights(grid, other.ends(header.path.length), *other.diameters, other.wavelength, sampling=sampling)
             for other in header.scintillometers
         ]
     )
@@ -89,4 +91,8 @@ def describe(model: Model, header: Header) -> dict[str, NDArray[Any]]:
         found["height_above_ground"] = np.where(inside, np.interp(grid.centres, at, height), np.nan)
     if header.scintillometers:
         found["scintillometer_weight"] = model.scintillometers
+        if model.surroundings is not None and (heights := model.surroundings.heights) is not None:
+            found["effective_height"] = np.array(
+                [effective_height(heights, weights) for weights in model.scintillometers]
+            )
     return found

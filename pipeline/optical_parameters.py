@@ -69,6 +69,25 @@ def _moment(edges: Array, length: float, low: float, high: float) -> Array:
     return np.asarray(np.sum(half * rule * value, axis=1))
 
 
+def fried_weights(grid: SliceGrid, path_length: float) -> Array:
+    """Weight of each slice in r0^(-5/3) of a spherical wave at the pupil, or of a plane one on an infinite path, m.
+
+    Parameters
+    ----------
+    grid : SliceGrid
+        Slices, by their distance from the pupil.
+    path_length : float
+        Distance of the source, m; may be infinite.
+
+    Returns
+    -------
+    ndarray of float, (k,)
+    """
+    if np.isinf(path_length):
+        return grid.thickness
+    return _moment(np.asarray(grid.edges), path_length, 0, 5 / 3)
+
+
 def optical_parameters(
     cn2: ArrayLike,
     grid: SliceGrid,

@@ -403,13 +403,50 @@ class Path(HeaderPart):
         return heights
 
 
+class SeriesFile(Parameters):
+    """Where a series of another instrument is, and what its files do not say."""
+
+    file: str = Field(min_length=1, max_length=MAX_TEXT)
+    """Path or pattern, beside the campaign file: Scintec ``.mnd``, NetCDF (``.nc``), or CSV with units."""
+    columns: dict[str, str] = {}
+    """Quantity -> column, where the names of the columns do not tell."""
+    units: dict[str, str] = {}
+    """Quantity -> unit, where the file has none or a wrong one."""
+    timezone: str | None = Field(default=None, max_length=100)
+    """Of times without an offset: `Europe/Paris`, `UTC+1`."""
+    interval: Duration | None = Field(default=None, gt=0)
+    """Length of the intervals; the most frequent step of the times where it is absent."""
+    stamp: Literal["start", "middle", "end"] | None = None
+    """What of its interval a time stamp means."""
+
+
 class Scintillometer(HeaderPart):
     """A large-aperture scintillometer on the same path, for comparison."""
+
+    # A header hands on what it does not know; a misspelt key of a campaign file would be lost without a word.
+    model_config = ConfigDict(extra="forbid", validate_default=True)
 
     name: Text
     wavelength: Wavelength = Field(gt=0)
     diameters: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]]
     """Of its apertures, at the pupil's end and at the sources' end."""
+    start: Length = "0 m"  # type: ignore[assignment]
+    """Distance of the aperture at the pupil's end from the pupil."""
+    end: Length | None = None
+    """Distance of the aperture at the sources' end from the pupil; that of the sources where it is absent."""
+    transmitter: Literal["pupil", "sources"] = "sources"
+    """End at which it emits; it does not matter to the weighting, and names the diameter that alpha belongs to."""
+    series: SeriesFile | None = None
+    """What it measured."""
+
+    def ends(self, path_length: float) -> tuple[float, float]:
+        """Distances of both apertures from the pupil, m."""
+        return self.start, path_length if self.end is None else self.end
+
+    @property
+    def reference(self) -> float:
+        """Diameter of the transmitter, m."""
+        return self.diameters[0 if self.transmitter == "pupil" else 1]
 
 
 class Source(HeaderPart):

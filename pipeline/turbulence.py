@@ -11,8 +11,7 @@ import math
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from scipy.integrate import quad
-from scipy.special import beta, betainc, gamma, j1
+from scipy.special import beta, betainc, gamma
 
 from .geometry import MAP_KINDS
 
@@ -250,7 +249,7 @@ def path_average(cn2: Array, weights: Array) -> float | Array:
         Profiles, m^(-2/3).
     weights : ndarray of float, (k,)
         Integral of the weight over each slice: the slices' thickness for the plain mean, or
-        :func:`scintillometer_weights`.
+        :func:`coslidar.pipeline.scintillometer.slice_weights`.
 
     Returns
     -------
@@ -267,63 +266,3 @@ def path_average(cn2: Array, weights: Array) -> float | Array:
         raise ValueError("the weights of a path average need a positive sum")
     mean = np.asarray(np.asarray(cn2) @ (weights / weights.sum()))
     return float(mean) if mean.ndim == 0 else mean
-
-
-def scintillometer_weights(
-    grid: SliceGrid,
-    wavelength: float,
-    path_length: float,
-    near_diameter: float,
-    far_diameter: float,
-    *,
-    sampling: Sampling = "mean",
-) -> Array:
-    """Weight of each slice in the Cn2 of a large-aperture scintillometer on the same path.
-
-    The log-amplitude variance of an incoherent disc seen by a disc weights Cn2(z) with the integral over kappa of
-    kappa^(-8/3) sin^2(kappa^2 z (L - z) / (2 k L)) A(kappa D_near (L - z) / (2 L)) A(kappa D_far z / (2 L)),
-    A(x) = (2 J1(x) / x)^2 (Wang, Ochs and Clifford 1978, https://doi.org/10.1364/JOSA.68.000334). It does not depend on
-    which end emits.
-
-    Parameters
-    ----------
-    grid : SliceGrid
-        Slices of the profile.
-    wavelength : float
-        Wavelength of the scintillometer, m.
-    path_length : float
-        Length L of the path, m.
-    near_diameter, far_diameter : float
-        Diameters of the apertures at z = 0 and at z = L, m.
-    sampling : {"mean", "midpoint"}
-        Weight averaged over each slice, or at its middle.
-
-    Returns
-    -------
-    ndarray of float, (k,)
-        Weights, normalised to a sum of 1.
-    """
-    k = 2 * np.pi / wavelength
-    # kappa = u^3 takes the singularity out; beyond 300 radii of the larger blur nothing is left.
-    nodes, rule = np.polynomial.legendre.leggauss(32)
-
-    def average(x: Array) -> Array:
-        safe = np.where(x == 0, 1.0, x)
-        return np.where(x == 0, 1.0, 2 * j1(safe) / safe) ** 2
-
-    def weight(z: float) -> float:
-        near, far = near_diameter * (1 - z / path_length) / 2, far_diameter * z / path_length / 2
-        edges = np.linspace(0, (300 / max(near, far)) ** (1 / 3), 121)
-        half = np.diff(edges)[:, None] / 2
-        u = (edges[:-1, None] + half) + half * nodes
-        kappa = u**3
-        swing = np.sin(kappa**2 * z * (1 - z / path_length) / (2 * k)) ** 2
-        return float(np.sum(half * rule * 3 * u**-6 * swing * average(kappa * near) * average(kappa * far)))
-
-    if sampling == "midpoint":
-        weights = np.array([weight(z) for z in grid.centres]) * grid.thickness
-    else:
-        weights = np.array(
-            [quad(weight, a, b, epsrel=1e-6)[0] for a, b in zip(grid.edges[:-1], grid.edges[1:], strict=True)]
-        )
-    return np.asarray(weights / weights.sum())

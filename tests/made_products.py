@@ -48,6 +48,8 @@ def static(slices=4):
         "fresnel_scale": np.linspace(0.01, 0.1, slices),
         "height_above_ground": np.linspace(10.0, 30.0, slices),
         "scintillometer_weight": np.full((1, slices), 1 / slices),
+        "effective_height": np.array([20.0]),
+        **{name: np.ones(1, SCHEMA[name].dtype) for name in SCHEMA if name.startswith("comparison_")},
         "response_slope": np.linspace(0, 1, 60 * slices).reshape(4, 5, 3, slices),
         "response_intensity": np.linspace(0, 1, 30 * slices).reshape(2, 5, 3, slices),
     }

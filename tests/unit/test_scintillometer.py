@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import pairwise
 
 import mpmath as mp
@@ -138,3 +139,18 @@ def test_saturation() -> None:
             (0.545 * 0.18) ** 0.6 * (2 * np.pi) ** 0.2, rel=1e-9
         )
     assert las.saturation_limit(L, 0.05, 0.145, 0.88e-6) < limit
+
+
+def test_weights_of_slices_by_quadrature() -> None:
+    def weight(z: float) -> float:
+        def integrand(log_kappa: float) -> float:
+            kappa = math.exp(log_kappa)
+            x, y = kappa * 0.025 * (1 - z / 2670), kappa * 0.0725 * z / 2670
+            phase = kappa**2 * z * (1 - z / 2670) * 0.88e-6 / (4 * np.pi)
+            return kappa ** (-5 / 3) * math.sin(phase) ** 2 * (2 * j1(x) / x) ** 2 * (2 * j1(y) / y) ** 2
+
+        return sum(quad(integrand, a, a + 0.25, limit=400)[0] for a in np.arange(-3, 10, 0.25))
+
+    found = las.slice_weights(GRID, (0.0, L), 0.05, 0.145, 0.88e-6, sampling="midpoint")
+    expected = np.array([weight(z) for z in GRID.centres])
+    assert np.allclose(found, expected / expected.sum(), rtol=1e-5)

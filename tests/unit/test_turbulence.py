@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad
-from scipy.special import j1
 
 from coslidar.pipeline.geometry import Geometry, SliceGrid
 from coslidar.pipeline.turbulence import (
@@ -18,7 +17,6 @@ from coslidar.pipeline.turbulence import (
     point_source_weights,
     resolution,
     scintillation_index,
-    scintillometer_weights,
     z_max,
 )
 
@@ -112,27 +110,3 @@ def test_path_average() -> None:
     assert path_average(np.stack([CN2, 2 * CN2]), weights) == pytest.approx([CN2[3], 2 * CN2[3]])
     with pytest.raises(ValueError, match="positive sum"):
         path_average(CN2, np.zeros(12))
-
-
-def test_scintillometer_with_equal_apertures_is_symmetric_and_moves_to_the_smaller() -> None:
-    equal = scintillometer_weights(GRID, 0.88e-6, 2670.0, 0.145, 0.145)
-    assert equal.sum() == pytest.approx(1)
-    assert np.allclose(equal, equal[::-1], rtol=1e-6)
-    near = scintillometer_weights(GRID, 0.88e-6, 2670.0, 0.05, 0.145)
-    assert GRID.centres @ near < GRID.centres @ equal
-    assert np.allclose(scintillometer_weights(GRID, 0.88e-6, 2670.0, 0.145, 0.05), near[::-1], rtol=1e-6)
-
-
-def test_scintillometer_weights_by_quadrature() -> None:
-    def weight(z: float) -> float:
-        def integrand(log_kappa: float) -> float:
-            kappa = math.exp(log_kappa)
-            x, y = kappa * 0.025 * (1 - z / 2670), kappa * 0.0725 * z / 2670
-            phase = kappa**2 * z * (1 - z / 2670) * 0.88e-6 / (4 * np.pi)
-            return kappa ** (-5 / 3) * math.sin(phase) ** 2 * (2 * j1(x) / x) ** 2 * (2 * j1(y) / y) ** 2
-
-        return sum(quad(integrand, a, a + 0.25, limit=400)[0] for a in np.arange(-3, 10, 0.25))
-
-    found = scintillometer_weights(GRID, 0.88e-6, 2670.0, 0.05, 0.145, sampling="midpoint")
-    expected = np.array([weight(z) for z in GRID.centres])
-    assert np.allclose(found, expected / expected.sum(), rtol=1e-5)
