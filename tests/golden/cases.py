@@ -48,7 +48,7 @@ TOLERANCE = 1e-6
 SAMPLED = 0.2
 #: Results of the retrieval that follow from draws.
 DRAWN = ("interval", "posterior_mean")
-#: Arrays longer than this are stored as so many entries of even step, and their norm.
+#: Arrays longer than this are stored as so many entries of even step, and their root mean square.
 LONGEST = 240
 
 Arrays = dict[str, np.ndarray]
@@ -88,11 +88,11 @@ class Case:
 
 
 def shortened(values: np.ndarray) -> list[float]:
-    """Numbers that stand for an array: itself, or a part of it and its norm."""
+    """Numbers that stand for an array: itself, or a part of it and its root mean square."""
     flat = values.astype(float).ravel()
     if len(flat) > LONGEST:
         step = -(-len(flat) // LONGEST)
-        flat = np.append(flat[::step], np.sqrt(np.nansum(flat**2)))
+        flat = np.append(flat[::step], np.sqrt(np.nanmean(flat**2)))
     return [float(f"{value:.12g}") for value in flat]
 
 
@@ -252,7 +252,20 @@ def measurements() -> Measurements:
 
 def stored_response() -> np.ndarray:
     stored = json.loads((VALUES / "response.json").read_text())["values"]
-    return np.stack([stored[f"slice_{i}"] for i in range(GRID.k)], axis=1)
+    columns = [np.concatenate([stored[f"slice_{i}_{kind}"] for kind in ("slope", "intensity")]) for i in range(GRID.k)]
+    return np.stack(columns, axis=1)
+
+
+def by_kind(name: str, values: np.ndarray) -> Arrays:
+    """Maps of slopes (1e-11 rad^2) and of intensities (1e-2) apart: each has its own largest value."""
+    flat = values.reshape(6, -1)
+    return {f"{name}_slope": flat[:4].ravel(), f"{name}_intensity": flat[4:].ravel()}
+
+
+def covariance(name: str, values: np.ndarray) -> Arrays:
+    """A covariance as logarithms of its variances and as correlations, for the same reason."""
+    deviation = np.sqrt(np.diagonal(values))
+    return {f"{name}_log_deviation": np.log(deviation), f"{name}_correlation": values / np.outer(deviation, deviation)}
 
 
 # --- stages ------------------------------------------------------------------------------------------------
@@ -276,10 +289,13 @@ def measure() -> Arrays:
 def reduce() -> Arrays:
     found = batch.reduce(measurements(), GEOMETRY, RATE, 4.0, CorrelationParameters())
     independent = batch.reduce(measurements(), GEOMETRY, RATE, 4.0, CorrelationParameters(covariance="independent"))
+    rest = {name: value for name, value in found.arrays.items() if name not in ("maps", "noise_covariance")}
     return {
-        **found.arrays,
+        **rest,
+        **by_kind("maps", found.arrays["maps"]),
+        **covariance("noise", found.arrays["noise_covariance"]),
+        **covariance("noise_independent", independent.arrays["noise_covariance"]),
         "quality_flag": np.asarray(found.quality_flag),
-        "noise_covariance_independent": independent.arrays["noise_covariance"],
     }
 
 
@@ -289,10 +305,9 @@ def response() -> Arrays:
     options = ResponseParameters().options(GEOMETRY)
     matrix = response_matrix(GEOMETRY, GRID, spectrum(), made, **options)
     midpoint = response_matrix(GEOMETRY, GRID, spectrum(), made, **{**options, "sampling": "midpoint"})
-    return {
-        **{f"slice_{i}": matrix[:, i] for i in range(GRID.k)},
-        "midpoint": midpoint,
-    }
+    slices = [part for i in range(GRID.k) for part in by_kind(f"slice_{i}", matrix[:, i]).items()]
+    middles = [part for i in range(GRID.k) for part in by_kind(f"midpoint_{i}", midpoint[:, i]).items()]
+    return dict([*slices, *middles])
 
 
 def retrieve() -> Arrays:
