@@ -6,6 +6,7 @@ Results, retries and resuming are the catalog's business; Prefect's caching and 
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,9 +18,12 @@ from prefect.states import Completed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.utilities.annotations import unmapped
 
+from ..catalog.products import open_product
+from ..catalog.report import write_report
+from .artifacts import ProgressTable, link_report
 from .driver import ArchiveOutcome, Work, execute, process_archive
 from .run import session
-from .settings import Settings, load
+from .settings import InputError, Settings, Unavailable, load
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -76,7 +80,8 @@ def processing_flow(settings: Settings, work: Work) -> list[ArchiveOutcome]:
         persist_result=False,
     )
     def campaign() -> list[ArchiveOutcome]:
-        return execute(work, settings.archives, in_tasks)
+        with ProgressTable(work.progress, "progress"):
+            return execute(work, settings.archives, in_tasks)
 
     try:
         return campaign()
@@ -85,25 +90,49 @@ def processing_flow(settings: Settings, work: Work) -> list[ArchiveOutcome]:
         raise KeyboardInterrupt from error
 
 
-@flow(name="reprocess", persist_result=False)
-def reprocess(campaign_file: str, output: str | None = None, assignments: list[str] | None = None) -> int:
-    """Process a campaign file; the entry point of deployments.
+@flow(name="reprocess", persist_result=False, validate_parameters=False)
+def reprocess(
+    campaigns: list[str], output: str | None = None, assignments: list[str] | None = None, report: bool = True
+) -> State[dict[str, int]]:
+    """Process campaign files one after the other; the entry point of deployments.
+
+    What a catalog has already is not computed again, so a schedule picks up what is new. One bad campaign never
+    stops the others.
 
     Parameters
     ----------
-    campaign_file : str
-        Campaign file, readable where the flow runs.
+    campaigns : list of str
+        Campaign files, readable where the flow runs.
     output : str, optional
-        Folder of the catalog instead of the file's.
+        Folder of the catalog instead of the files' own.
     assignments : list of str, optional
-        ``table.key=value`` on top of the file.
+        ``table.key=value`` on top of each file.
+    report : bool
+        Write ``report.html`` beside the catalog, and link it from the flow run.
 
     Returns
     -------
-    int
-        Number of archives that were not published.
+    State
+        Number of archives by outcome; failed where an archive or a campaign was refused or failed.
     """
-    settings = load(Path(campaign_file), output=Path(output) if output else None, assignments=assignments or [])
-    with session(settings) as work:
-        outcomes = execute(work, settings.archives, in_tasks)
-    return sum(outcome.status in ("refused", "failed") for outcome in outcomes)
+    counts: Counter[str] = Counter()
+    faults: list[str] = []
+    for name in campaigns:
+        try:
+            settings = load(Path(name), output=Path(output) if output else None, assignments=assignments or [])
+            with session(settings) as work, ProgressTable(work.progress, "progress"):
+                outcomes = execute(work, settings.archives, in_tasks)
+        except (InputError, Unavailable) as error:
+            counts["campaign refused"] += 1
+            faults += getattr(error, "faults", [str(error)])
+            continue
+        counts.update(outcome.status for outcome in outcomes)
+        faults += [fault for outcome in outcomes for fault in outcome.faults]
+        made = [outcome.product for outcome in outcomes if outcome.product]
+        if report and made and any(outcome.status == "published" for outcome in outcomes):
+            write_report([open_product(path) for path in made], page := settings.output / "report.html")
+            link_report(page)
+    words = ", ".join(f"{number} {status}" for status, number in sorted(counts.items())) or "no archive"
+    if faults:
+        return Failed(message=f"{words}: {'; '.join(faults)}"[:2000], data=dict(counts))
+    return Completed(message=words, data=dict(counts))
