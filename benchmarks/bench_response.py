@@ -80,7 +80,7 @@ def main() -> None:
     exact = quadrature(1e-8)
     size = np.abs(exact.reshape(6, 81, 12)).max(axis=1)
     print(f"{'method':34s} {'CPU s':>7s}  slice  " + "  ".join(f"{kind:>8s}" for kind in MAP_KINDS))
-    runs = [(f"quadrature, tolerance {t:.0e}", quadrature, (t,)) for t in (1e-4, 1e-5, 5e-7, 5e-8)]
+    runs = [(f"quadrature, tolerance {t:.0e}", quadrature, (t,)) for t in (1e-4, 1e-5, response.TOLERANCE, 1e-7)]
     runs += [
         (f"FFT {n} x {n}, {layers} layers a slice", fft_grid, (n, layers))
         for n, layers in ((256, 1), (256, 4), (512, 2))

@@ -58,7 +58,7 @@ Aperture = Literal["square", "circular"]
 Tilt = Literal["gradient", "zernike"]
 
 #: Error of each map, relative to its maximum, that shells of frequencies and panels along z may leave.
-TOLERANCE = 5e-7
+TOLERANCE = 1e-6
 
 #: Nodes per radian of phase in radius (see `_shells`), growth of the shells, nodes that fit the cache.
 _NODES_PER_RADIAN = 0.36

@@ -196,18 +196,23 @@ class Image(SourceModelBase):
     def transfer(self, fx: NDArray[np.float64], fy: NDArray[np.float64]) -> NDArray[np.complex128]:
         """P~(f); see :meth:`SourceModelBase.transfer`."""
         weights, x, y = self._pixels()
-        pixel = np.sinc(fx * self.pixel_size) * np.sinc(fy * self.pixel_size)
-        return np.asarray(pixel * _sum_over(weights, x, y, fx, fy))
+        along_x, along_y = self._waves(fx, x), self._waves(fy, y)
+        bars = np.sinc(fx * self.pixel_size) * np.sinc(fy * self.pixel_size)
+        return np.asarray(bars * _sum(along_y @ weights, along_x).reshape(bars.shape))
 
     def moment(self, fx: NDArray[np.float64], fy: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
         """Transforms of x P and y P; see :meth:`SourceModelBase.moment`."""
         weights, x, y = self._pixels()
-        plain = _sum_over(weights, x, y, fx, fy)
+        along_x, along_y = self._waves(fx, x), self._waves(fy, y)
         bar_x, bar_y = np.sinc(fx * self.pixel_size), np.sinc(fy * self.pixel_size)
         own_x, own_y = _sinc_moment(fx, self.pixel_size), _sinc_moment(fy, self.pixel_size)
-        along_x = bar_x * bar_y * _sum_over(weights * x, x, y, fx, fy) - 1j * own_x * bar_y * plain
-        along_y = bar_x * bar_y * _sum_over(weights * y[:, None], x, y, fx, fy) - 1j * bar_x * own_y * plain
-        return along_x, along_y
+        rows = along_y @ weights
+        plain, with_x = (_sum(rows, waves).reshape(bar_x.shape) for waves in (along_x, along_x * x))
+        with_y = _sum((along_y * y) @ weights, along_x).reshape(bar_x.shape)
+        return (
+            np.asarray(bar_x * bar_y * with_x - 1j * own_x * bar_y * plain),
+            np.asarray(bar_x * bar_y * with_y - 1j * bar_x * own_y * plain),
+        )
 
     def _pixels(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Normalised weights (rows, columns), and the pixels' x and y from the centroid."""
@@ -217,16 +222,14 @@ class Image(SourceModelBase):
         y = np.arange(values.shape[0]) * self.pixel_size
         return weights, x - weights.sum(axis=0) @ x, y - weights.sum(axis=1) @ y
 
+    def _waves(self, f: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """exp(-2 pi i f s) at every frequency and place, (f.size, places); the places are a pixel apart."""
+        waves = np.empty((f.size, places.size), dtype=complex)
+        waves[:, 0] = np.exp(-2j * np.pi * places[0] * f.ravel())
+        waves[:, 1:] = np.exp(-2j * np.pi * self.pixel_size * f.reshape(-1, 1))
+        return np.asarray(np.cumprod(waves, axis=1))
 
-def _sum_over(
-    weights: NDArray[np.float64],
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    fx: NDArray[np.float64],
-    fy: NDArray[np.float64],
-) -> NDArray[np.complex128]:
-    """Sum of w_ij exp(-2 pi i (fx x_j + fy y_i)) at every frequency."""
-    fx, fy = np.broadcast_arrays(fx, fy)
-    along_x = np.exp(-2j * np.pi * fx.reshape(-1, 1) * x)
-    along_y = np.exp(-2j * np.pi * fy.reshape(-1, 1) * y)
-    return np.asarray(np.einsum("nj,nj->n", along_y @ weights, along_x).reshape(fx.shape))
+
+def _sum(rows: NDArray[np.complex128], waves: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Sum over the columns at every frequency."""
+    return np.asarray(np.einsum("nj,nj->n", rows, waves))
