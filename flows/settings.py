@@ -307,7 +307,7 @@ def load(
     """
     origin = safe(str(campaign_file)) if campaign_file is not None else "command line"
     folder = campaign_file.parent if campaign_file is not None else Path()
-    table = read_campaign(campaign_file) if campaign_file is not None else {}
+    table = _beside(read_campaign(campaign_file), folder) if campaign_file is not None else {}
     faults: list[str] = []
     for assignment in assignments:
         try:
@@ -387,6 +387,27 @@ def load(
         surroundings=surroundings,
         folder=folder,
     )
+
+
+def _beside(table: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The same settings, with the files that they name looked for beside the campaign file."""
+    table = dict(table)
+    places: list[tuple[dict[str, Any], str]] = [(table, "source")]
+    if isinstance(table.get("response"), dict):
+        table["response"] = dict(table["response"])
+        places.append((table["response"], "band"))
+    for place, key in places:
+        given = place.get(key)
+        if isinstance(given, str) and "file" in given and "=" in given:
+            try:
+                given = plugin_text(given if key == "source" else f":{given}")
+            except InputError:
+                continue  # whoever reads the text says what is wrong with it
+            if key == "band":
+                del given["name"]
+        if isinstance(given, dict) and isinstance(given.get("file"), str):
+            place[key] = {**given, "file": str(folder / given["file"])}
+    return table
 
 
 def _with_preset(table: dict[str, Any], origin: str, faults: list[str]) -> dict[str, Any]:
