@@ -26,13 +26,13 @@ from starlette.routing import Route
 from ...catalog import export
 from ...catalog.database import DatabaseError
 from ...catalog.products import ProductError
-from ...catalog.report import BATCH_PANELS, TIME_PANELS, figure_style, render
+from ...catalog.report import BATCH_PANELS, TIME_PANELS, render
 from ...catalog.report.batch_panels import profile_rows
 from ...catalog.report.reading import LEVELS, bounds, flag_names, flags, levels
+from ...catalog.report.two_lineages import differences, slice_rows, summary_rows, two_profiles_markup
 from ...catalog.report.words import clean, clock, interval, mapping, number
 from ...catalog.store import CatalogError
-from .comparison import differences, draw_two_profiles, slice_rows, summary_rows
-from .panels import FORMATS, PANELS, Drawn, figure_bytes, figure_markup, panel_markup
+from .panels import FORMATS, PANELS, Drawn, figure_bytes, panel_markup
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -342,7 +342,7 @@ class Pages:
             i, j = summary[chosen]["batches"]
             slices = slice_rows(a, b, i, j)
             key = ("compare", i, j, *((row.id, row.sha256) for row in rows))
-            drawn = self._drawn.get(key, lambda: {"svg": _two_profiles((a, b), (i, j))})
+            drawn = self._drawn.get(key, lambda: {"svg": two_profiles_markup((a, b), (i, j))})
         return self._page(
             "compare.html",
             title="Two lineages",
@@ -411,17 +411,6 @@ class Pages:
         if found is None:
             raise Refusal(404, "there is no such file")
         return Response(found[0], media_type=found[1])
-
-
-def _two_profiles(products: tuple[Dataset, Dataset], batches: tuple[int, int]) -> str:
-    from matplotlib.figure import Figure
-
-    with figure_style():
-        drawn = Figure(figsize=(10.0, 4.6))
-        draw_two_profiles(drawn.add_axes((0.105, 0.155, 0.88, 0.73)), products, batches, ("A", "B"))
-    rows = slice_rows(*products, *batches)
-    text = f"Two profiles of Cn² against distance; the table below has the numbers of all {len(rows)} slices."
-    return figure_markup(drawn, "cmp", "Profiles of A and B", text)
 
 
 @lru_cache(1)

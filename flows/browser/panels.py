@@ -15,7 +15,6 @@ from ...catalog.report.reading import values
 from ...catalog.report.svg import inline_svg
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from xarray import Dataset
 
 #: Formats of a figure that can be downloaded -> media type.
@@ -59,12 +58,6 @@ def panel_markup(key: str, products: Sequence[Dataset], batch: int = 0) -> dict[
         with figure_style():
             drawn = inline_svg(figure(panel, products, batch), f"p{key[:2]}", panel.title, text)
     return {"key": key, "title": panel.title, "reading": panel.reading, "text": text, "svg": drawn}
-
-
-def figure_markup(drawn: Figure, prefix: str, title: str, text: str) -> str:
-    """Any figure as inline markup."""
-    with figure_style():
-        return inline_svg(drawn, prefix, title, text)
 
 
 def figure_bytes(key: str, products: Sequence[Dataset], batch: int, form: str) -> bytes:

@@ -31,7 +31,9 @@ OWNERS = {
     "click": ("flows/",),
     "rich": ("flows/",),
     "matplotlib": ("catalog/report/",),
-    "jinja2": ("catalog/report/",),
+    "jinja2": ("catalog/report/", "flows/browser/"),
+    "starlette": ("flows/browser/",),
+    "uvicorn": ("flows/browser/",),
 }
 #: Prefect is wired in one module and served from another; the driver knows nothing of it.
 PREFECT = {"flows/campaign.py"}

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...catalog.report.page import path_mean
-from ...catalog.report.reading import bounds, edges, log_mu, of_batch, scalar
-from ...catalog.report.style import BLUE, RED
-from ...catalog.report.words import mapping, number, scientific
+from .page import path_mean
+from .reading import bounds, edges, log_mu, of_batch, scalar
+from .style import BLUE, RED, figure_style
+from .svg import inline_svg
+from .words import mapping, number, scientific
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -107,6 +108,17 @@ def draw_two_profiles(ax: Axes, products: Sequence[Dataset], batches: Sequence[i
     ax.grid(axis="y", which="major")
     ax.legend(loc="lower left", bbox_to_anchor=(-0.01, 1.0), ncol=2)
     return ax
+
+
+def two_profiles_markup(products: tuple[Dataset, Dataset], batches: tuple[int, int]) -> str:
+    """The profiles of two batches as inline markup, called A and B."""
+    from matplotlib.figure import Figure
+
+    text = "Two profiles of Cn² against distance, A solid and B dashed; the table has their numbers."
+    with figure_style():
+        drawn = Figure(figsize=(10.0, 4.6))
+        draw_two_profiles(drawn.add_axes((0.105, 0.155, 0.88, 0.73)), products, batches, ("A", "B"))
+        return inline_svg(drawn, "cmp", "Profiles of A and B", text)
 
 
 def slice_rows(a: Dataset, b: Dataset, i: int, j: int) -> list[list[str]]:
