@@ -7,12 +7,13 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-all bench bench-chain lint dev constraints clean
+.PHONY: help demo test test-all docs bench bench-chain lint dev constraints clean
 
 help:
 	@echo "make demo      install, simulate a small recording, profile it, draw a report"
 	@echo "make test      install and run the test suite"
 	@echo "make test-all  the same with the slow science checks"
+	@echo "make docs      the documentation as pages, docs/_build/html/index.html"
 	@echo "make bench     every benchmark, as ratios;  make bench-chain: chain against reading"
 	@echo "make lint      ruff and mypy;  make dev: what an editor needs"
 
@@ -55,6 +56,16 @@ test: $(VENV)/.test
 test-all: $(VENV)/.test
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
 
+$(VENV)/.docs: $(VENV)/.core
+	@echo "installing what builds the documentation ..."
+	@$(PIP) install -qq -c constraints.txt -e ".[docs]" || { echo "make: the installation failed; pip needs a package" \
+	  "index (PyPI or a mirror) to reach"; exit 1; }
+	@touch $@
+
+docs: $(VENV)/.docs
+	@$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+	@echo "Next:  open docs/_build/html/index.html in a browser"
+
 bench: $(VENV)/.test
 	@for b in benchmarks/bench_*.py; do echo "== $$b"; $(BIN)/python $$b || exit 1; done
 
@@ -73,4 +84,4 @@ constraints: $(VENV)/.test
 	@{ sed -n '/^#/p' constraints.txt; $(PIP) freeze --exclude-editable; } > constraints.new && mv constraints.new constraints.txt
 
 clean:
-	rm -rf $(VENV) .dev demo bench-data build *.egg-info
+	rm -rf $(VENV) .dev demo bench-data build docs/_build docs/reference *.egg-info
