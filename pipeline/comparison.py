@@ -163,6 +163,53 @@ def compare(ours: Array, ours_error: Array, theirs: Array, theirs_error: Array) 
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Two series of Cn2 on one time base.
+
+    Parameters
+    ----------
+    name : str
+        Name of the other instrument.
+    bounds : ndarray of int64, (n, 2)
+        Windows, ns since 1970 UTC.
+    ours, ours_error, theirs, theirs_error : ndarray of float, (n,)
+        Cn2 of profiles as the instrument weights it, its own, and standard errors, m^(-2/3).
+    """
+
+    name: str
+    bounds: Times
+    ours: Array
+    ours_error: Array
+    theirs: Array
+    theirs_error: Array
+
+    def comparison(self) -> Comparison:
+        """How they compare."""
+        return compare(self.ours, self.ours_error, self.theirs, self.theirs_error)
+
+
+def emulate(cn2: Array, covariance: Array, weights: Array) -> tuple[Array, Array]:
+    """Path averages of profiles, with errors from their posterior.
+
+    Parameters
+    ----------
+    cn2 : ndarray of float, (n, k)
+        Profiles, m^(-2/3).
+    covariance : ndarray of float, (n, k, k)
+        Covariances of their posterior, m^(-4/3).
+    weights : ndarray of float, (k,)
+        Weights of the slices, summing to 1.
+
+    Returns
+    -------
+    value, error : ndarray of float, (n,)
+        Averages and standard errors, m^(-2/3).
+    """
+    variance = np.einsum("i,nij,j->n", weights, covariance, weights)
+    return cn2 @ weights, np.sqrt(np.maximum(variance, 0.0))
+
+
 def on_windows(bounds: Times, values: Array, errors: Array, windows: Times, coverage: float = 0.5) -> Means:
     """Means of values whose errors are known, over windows of another time base.
 

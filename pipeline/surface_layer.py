@@ -362,7 +362,7 @@ def solve(
     outcome["t"][calm], outcome["residual"][calm] = 0.0, 0.0
     outcome["length"][calm] = np.inf * sign[calm]
     return Fluxes(
-        kinematic=(-outcome["u"] * outcome["t"]).reshape(shape),
+        kinematic=(0.0 - outcome["u"] * outcome["t"]).reshape(shape),
         friction_velocity=outcome["u"].reshape(shape),
         temperature_scale=outcome["t"].reshape(shape),
         obukhov_length=outcome["length"].reshape(shape),
