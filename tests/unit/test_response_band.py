@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from scipy.integrate import quad
 from scipy.special import gamma, sici
 
+from coslidar.flows.settings import load
 from coslidar.pipeline.band import Band
 from coslidar.pipeline.geometry import Geometry
 from coslidar.pipeline.lineage import canonical
@@ -218,3 +219,28 @@ def test_the_response_key_follows_every_option() -> None:
     assert len(keys) == len(changed) + 1
     # How many slices there are, and where they end, stands in the edges.
     assert ResponseParameters(slices=5).tracked() == plain.tracked()
+
+
+def test_files_that_a_campaign_file_names_lie_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "cal").mkdir()
+    np.savetxt(tmp_path / "cal" / "filter.csv", [[3.4, 1], [4.2, 2]], delimiter=",")
+    np.save(tmp_path / "cal" / "lamp.npy", np.ones((2, 3)))
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    made = []
+    for band, source in (
+        ('{ file = "cal/filter.csv", unit = "um" }', '{ name = "image", file = "cal/lamp.npy", pixel_size = "1 cm" }'),
+        ('"file=cal/filter.csv,unit=um"', '"image:file=cal/lamp.npy,pixel_size=1 cm"'),
+    ):
+        (tmp_path / "campaign.toml").write_text(f"source = {source}\n[response]\nband = {band}\n")
+        settings = load(tmp_path / "campaign.toml")
+        made.append((settings.configuration.response, settings.plugins["source"]))
+    assert made[0] == made[1]
+    assert made[0][0].band is not None
+    assert made[0][0].band.weight == (1.0, 2.0)
+    # What the command line names lies where the command is given.
+    np.savetxt(elsewhere / "other.csv", [[3.5, 1], [4.2, 2]], delimiter=",")
+    band = load(assignments=["response.band.file=other.csv", "response.band.unit=um"]).configuration.response.band
+    assert band is not None
+    assert band.wavelength[0] == 3.5e-6
