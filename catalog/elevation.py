@@ -139,19 +139,20 @@ def _of_map(
                 raise SeriesError([f"{origin}: the map does not say its coordinate system"])
             xs, ys = transform("EPSG:4326", opened.crs, lon.tolist(), lat.tolist())
             band = opened.read(1, masked=True).astype(np.float64).filled(np.nan)
-            inverse = ~opened.transform
+            a, b, c, d, e, f = (~opened.transform)[:6]
     except rasterio.errors.RasterioError as error:
         raise SeriesError([f"{origin}: this is no map that can be read: {safe(str(error))}"]) from error
+    x, y = np.array(xs), np.array(ys)
     # Corners of pixels are whole numbers, elevations belong to their centres.
-    cols, rows = np.array([inverse * (x, y) for x, y in zip(xs, ys, strict=True)]).T - 0.5
+    cols, rows = a * x + b * y + c - 0.5, d * x + e * y + f - 0.5
     j, i = np.floor(cols).astype(int), np.floor(rows).astype(int)
     inside = (i >= 0) & (j >= 0) & (i < band.shape[0] - 1) & (j < band.shape[1] - 1)
     if not inside.all():
         raise SeriesError([f"{origin}: the map does not cover the line of sight"])
-    a, b = rows - i, cols - j
-    elevation = (1 - a) * ((1 - b) * band[i, j] + b * band[i, j + 1]) + a * (
-        (1 - b) * band[i + 1, j] + b * band[i + 1, j + 1]
-    )
+    down, right = rows - i, cols - j
+    upper = (1 - right) * band[i, j] + right * band[i, j + 1]
+    lower = (1 - right) * band[i + 1, j] + right * band[i + 1, j + 1]
+    elevation = (1 - down) * upper + down * lower
     if not np.isfinite(elevation).all():
         raise SeriesError([f"{origin}: the map has holes below the line of sight"])
     return share * path_length, elevation

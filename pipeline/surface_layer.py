@@ -216,7 +216,7 @@ class Fluxes:
 
 
 #: -z / L and z / L that are searched, and steps of the search in between.
-_LEAST, _MOST, _STEPS = 1e-7, 1e4, 96
+_LEAST, _MOST, _STEPS = 1e-12, 1e4, 128
 
 
 def solve(
