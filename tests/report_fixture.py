@@ -139,8 +139,43 @@ def product(
         "quality_flag": np.where(index * 4 > 0.3, 256, 0).astype("i4"),
         "quality_level": np.where(index * 4 > 0.3, 1, 0).astype("i1"),
     }  # fmt: skip
+    order = np.arange(1, 6)
+    noll = 2e-1 * (order + 1) ** (-11 / 3) * trend[:, None, None] * np.ones((1, sources, 1))
+    chi = FIXED_COORDINATES["log_amplitude"]
+    deviation = np.sqrt(index / 4)[:, None] * np.ones(sources)
+    frequency = np.arange(142) * 0.5 + 0.25
+    spectrum = 1e-12 * trend[:, None, None] / (1 + (frequency / 2) ** (11 / 3)) * np.array([1, 2])[:, None] + 1e-16
+    spectrum[..., 99:101] += 3e-13
+    size = np.sqrt(3.8e-6 * centre * LENGTH / (LENGTH - centre))
+    weight = centre * (LENGTH - centre) / LENGTH**2
+    width_z = LENGTH / slices
+    values |= {
+        "z_max": np.asarray(692.0),
+        "z_first": np.asarray(214.8),
+        "fresnel_scale": size,
+        "height_above_ground": 12 + 20 * weight,
+        "scintillometer_weight": np.tile(weight / weight.sum(), (2, 1)),
+        "cn2_path_average": cn2.mean(axis=1)[:, None] * [0.8, 1.2],
+        "cn2_path_average_interval_68": cn2.mean(axis=1)[:, None, None] * np.array([[0.75, 0.85], [1.1, 1.3]]),
+        "response_slope": 1e3 * width_z * (0.3 + bump(0.3, 0.2)[..., None]) * (1 - centre / LENGTH)
+        * np.ones((4, 1, 1, 1)),
+        "response_intensity": 1e11 * width_z * weight * np.exp(-(dy[..., None] ** 2 + dx[..., None] ** 2) / size**2)
+        * np.ones((2, 1, 1, 1)),
+        "cn2_other_mu": np.stack([cn2 * np.exp(0.4 * random.standard_normal(cn2.shape)), 0.6 * cn2], axis=1),
+        "cn2_other_mu_standard_error": np.stack([3 * error, 0.4 * error], axis=1),
+        "slope_spectrum": spectrum,
+        "vibration_frequency": np.full(batches, 50.0),
+        "vibration_variance": np.tile([1e-12, 4e-12], (batches, 1)),
+        "zernike_variance": noll * np.exp(0.2 * random.standard_normal(noll.shape)),
+        "zernike_variance_kolmogorov": noll,
+        "log_amplitude_count": np.rint(1e5 * 0.01 * np.exp(-((chi / deviation[..., None]) ** 2) / 2)
+                                       / deviation[..., None]).astype("i8"),
+        "log_amplitude_mean": np.zeros((batches, sources)),
+        "log_amplitude_deviation": deviation,
+    }  # fmt: skip
     # Checks that no figure shows.
-    sizes = {"time": batches, "source": sources, "axis": 2, "axis_kind": 3}
+    sizes = {"time": batches, "source": sources, "axis": 2, "axis_kind": 3, "z": slices, "z_true": slices, "bound": 2,
+             "scintillometer": 2, "dy": 9, "dx": 9, "slope_kind": 4, "intensity_kind": 2}  # fmt: skip
     sizes |= {name: len(value) for name, value in FIXED_COORDINATES.items()}
     for name in sorted(set(SCHEMA) - set(values) - {"r0_direct"}):
         values[name] = np.full([sizes[dim] for dim in SCHEMA[name].dims], 0.01).astype(SCHEMA[name].dtype)
@@ -155,7 +190,15 @@ def product(
     times = begin.astype("datetime64[ns]") if decoded else begin
     if decoded:
         values["time_bounds"] = values["time_bounds"].astype("datetime64[ns]")
-    coordinates = {"time": times, "z": centre, "z_true": centre, "dy": lag, "dx": lag, "log_mu_grid": grid}
+    coordinates = {
+        "time": times,
+        "z": centre,
+        "z_true": centre,
+        "dy": lag,
+        "dx": lag,
+        "log_mu_grid": grid,
+        "frequency": frequency,
+    }
     coordinates |= FIXED_COORDINATES
     assert set(values) == set(SCHEMA)
     assert set(coordinates) == set(COORDINATES)
@@ -164,6 +207,7 @@ def product(
         {
             **{name: ((name,), value) for name, value in coordinates.items()},
             "source": ["bottom", "top"][:sources],
+            "scintillometer": ["LAS A", "LAS B"],
             "slope_kind": list(SLOPE_KINDS),
             "intensity_kind": list(INTENSITY_KINDS),
         },

@@ -14,6 +14,7 @@ from .batch_panels import (
     draw_profile,
 )
 from .page import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, figure, render, write_report
+from .printed import write_pdf, write_png
 from .style import figure_style
 from .time_panels import (
     draw_chi2,
@@ -44,5 +45,7 @@ __all__ = [
     "figure",
     "figure_style",
     "render",
+    "write_pdf",
+    "write_png",
     "write_report",
 ]

@@ -6,6 +6,7 @@ of the report, and each `describe_…` says in words what the figure shows.
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...pipeline.geometry import MAP_KINDS
 from .reading import Floats, Maps, edges, log_mu, maps, of_batch, scalar
-from .style import BLUE, DIVERGING, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
+from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
 from .words import measured, number, scientific
 
 if TYPE_CHECKING:
@@ -37,12 +38,15 @@ KIND_TITLES = {
 }
 #: Residuals beyond this many of their errors carry a sign in the map.
 NOTABLE = 3.0
-_LEGEND = ("retrieved", "MAP bar", "maximum-likelihood bar", "bar goes on", "upper limit")
+_INTERVAL = "68 % and 95 % interval"
+_HEIGHT = r"$h^{-4/3}$ over the terrain"
+_LEGEND = ("retrieved", "MAP bar", _INTERVAL, "maximum-likelihood bar", "bar goes on", "upper limit", _HEIGHT)
 #: rad^2 are shown as µrad^2.
 _MICRO = 1e12
 
 
-def _note(ax: Axes, text: str) -> Axes:
+def note(ax: Axes, text: str) -> Axes:
+    """Say in empty axes why they are empty."""
     ax.text(0.5, 0.5, text, ha="center", va="center", color=MUTED, transform=ax.transAxes)
     ax.set_xticks([])
     ax.set_yticks([])
@@ -81,8 +85,35 @@ def _limits(dataset: Dataset, batch: int, shape: tuple[int, ...]) -> tuple[Float
     return error, blank if error_ml is None else error_ml, active, np.where(active, upper, np.nan)
 
 
-def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
-    """Draw the profile of a batch: slices as steps, MAP and ML bars, upper limits where the bound is active.
+def cn2_limits(dataset: Dataset, batch: int) -> tuple[float, float] | None:
+    """Limits of the Cn2 axis that show the profile of a batch with its MAP bars; None where every slice is at zero."""
+    cn2 = of_batch(dataset, "cn2", batch)
+    if cn2 is None:
+        return None
+    error, _, active, limit = _limits(dataset, batch, cn2.shape)
+    shown = np.isfinite(cn2) & (cn2 > 0) & ~active
+    seen = np.concatenate([cn2[shown], (cn2 + error)[shown], limit])
+    seen = seen[np.isfinite(seen) & (seen > 0)]
+    if not seen.size:
+        return None
+    top = 1.6 * float(seen.max())
+    low = float(min([*cn2[shown], *limit[np.isfinite(limit) & (limit > 0)]]))
+    return max(low / 3, top / 1e5), top
+
+
+def draw_profile(
+    ax: Axes,
+    dataset: Dataset,
+    batch: int = 0,
+    *,
+    bars: Collection[str] = ("map", "interval", "ml"),
+    legend: bool = True,
+    scale: tuple[float, float] | None = None,
+) -> Axes:
+    """Draw the profile of a batch: slices as steps, every kind of bar, upper limits where the bound is active.
+
+    Where the product knows the height above ground, a dashed line shows Cn2 proportional to its power of -4/3 (free
+    convection; Wyngaard, Izumi and Collins 1971, https://doi.org/10.1364/JOSA.61.001646), scaled to the profile.
 
     Parameters
     ----------
@@ -92,6 +123,13 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
         A product.
     batch : int
         Number of the batch in the product.
+    bars : collection of str
+        Which of "map" (MAP bars), "interval" (intervals of the posterior that hold 68 % and 95 %), "ml"
+        (maximum-likelihood bars).
+    legend : bool
+        Whether to say what is what.
+    scale : (float, float), optional
+        Limits of the Cn2 axis; those of :func:`cn2_limits` where they are absent.
 
     Returns
     -------
@@ -100,18 +138,16 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     """
     cn2 = of_batch(dataset, "cn2", batch)
     if cn2 is None or not np.isfinite(cn2).any():
-        return _note(ax, "no profile")
+        return note(ax, "no profile")
     border = edges(dataset)
     centre, width = (border[1:] + border[:-1]) / 2, np.diff(border)
     error, error_ml, active, limit = _limits(dataset, batch, cn2.shape)
     shown = np.isfinite(cn2) & (cn2 > 0) & ~active
 
-    seen = np.concatenate([cn2[shown], (cn2 + error)[shown], limit])
-    seen = seen[np.isfinite(seen) & (seen > 0)]
-    if not seen.size:
-        return _note(ax, "every slice is at the bound")
-    top = 1.6 * seen.max()
-    bottom = max(min([*cn2[shown], *limit[np.isfinite(limit) & (limit > 0)]]) / 3, top / 1e5)
+    scale = scale or cn2_limits(dataset, batch)
+    if scale is None:
+        return note(ax, "every slice is at the bound")
+    bottom, top = scale
     ax.set_yscale("log")
     ax.set_ylim(bottom, top)
     ax.set_xlim(border[0], border[-1])
@@ -120,18 +156,28 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     ax.stairs(np.where(shown, cn2, bottom), border, baseline=bottom, fill=True, color=BLUE, alpha=0.13, lw=0)
     ax.stairs(steps, border, baseline=None, color=BLUE, lw=2.2, label="retrieved")
 
-    def bars(at: Floats, bar: Floats, where: Flags, **style: object) -> None:
+    def draw_bars(at: Floats, bar: Floats, where: Flags, **style: object) -> None:
         # On a logarithmic axis a bar that reaches below zero ends under the axis, not nowhere.
         here = where & np.isfinite(bar) & (bar > 0)
         low = np.minimum(bar, cn2 - np.minimum(cn2, bottom) / 2)
         ax.errorbar(at[here], cn2[here], yerr=np.stack([low, bar])[:, here], **style)  # type: ignore[arg-type]
 
-    bars(centre - 0.14 * width, error, shown, fmt="o", color=BLUE, mfc=BLUE, ms=6, capsize=4, lw=2, label="MAP bar")
-    bars(centre + 0.14 * width, error_ml, shown & (error_ml < 1e3 * top), fmt="D", color=RED, mfc=PAPER, ms=5.5,
-         capsize=4, lw=1.2, label="maximum-likelihood bar")  # fmt: skip
-    beyond = shown & ~np.isnan(error_ml) & (cn2 + error_ml > top)
+    if "map" in bars:
+        draw_bars(centre - 0.23 * width, error, shown, fmt="o", color=BLUE, mfc=BLUE, ms=5.5, capsize=4, lw=2,
+                  label="MAP bar")  # fmt: skip
+    if "interval" in bars:
+        for name, thickness, label in (("cn2_interval_95", 1.4, "_"), ("cn2_interval_68", 4.5, _INTERVAL)):
+            ends = of_batch(dataset, name, batch)
+            if ends is not None:
+                here = shown & np.isfinite(ends).all(axis=-1) & (ends[:, 1] > bottom)
+                ax.vlines(centre[here], np.maximum(ends[here, 0], bottom / 2), ends[here, 1], color=GREEN, lw=thickness,
+                          label=label)  # fmt: skip
+    beyond = shown & ~np.isnan(error_ml) & (cn2 + error_ml > top) & ("ml" in bars)
+    if "ml" in bars:
+        draw_bars(centre + 0.23 * width, error_ml, shown & (error_ml < 1e3 * top), fmt="D", color=RED, mfc=PAPER, ms=5,
+                  capsize=4, lw=1.2, label="maximum-likelihood bar")  # fmt: skip
     if beyond.any():
-        ax.plot((centre + 0.14 * width)[beyond], np.full(beyond.sum(), 0.985), "^", color=RED, mfc=PAPER, ms=7,
+        ax.plot((centre + 0.23 * width)[beyond], np.full(beyond.sum(), 0.985), "^", color=RED, mfc=PAPER, ms=7,
                 transform=ax.get_xaxis_transform(), clip_on=False, label="bar goes on")  # fmt: skip
     arrows = active & np.isfinite(limit) & (limit > bottom)
     if arrows.any():
@@ -140,19 +186,36 @@ def draw_profile(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
         ax.hlines(high, x - 0.4 * width[arrows], x + 0.4 * width[arrows], color=PURPLE, lw=2.2)
         ax.vlines(x, low, high, color=PURPLE, lw=2.2)
         ax.plot(x, low, "v", color=PURPLE, ms=9, label="upper limit")
+    ground = _over_ground(dataset, cn2, error)
+    if legend and ground is not None:
+        ax.plot(centre, ground, color=INK, ls=(0, (5, 3)), lw=1.5, label=_HEIGHT)
     ax.set_xlabel("distance from the pupil z (m)")
     ax.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
     ax.grid(axis="y", which="major")
+    if not legend:
+        return ax
     handles, labels = ax.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: _LEGEND.index(labels[i]))
     ax.legend([handles[i] for i in order], [labels[i] for i in order], loc="lower left", bbox_to_anchor=(-0.01, 1.0),
-              ncol=5, columnspacing=1.4, handletextpad=0.5)  # fmt: skip
+              ncol=4, columnspacing=1.4, handletextpad=0.5)  # fmt: skip
     return ax
+
+
+def _over_ground(dataset: Dataset, cn2: Floats, error: Floats) -> Floats | None:
+    """Cn2 proportional to h^(-4/3), as close to the profile as its MAP bars ask for; None without heights."""
+    if "height_above_ground" not in dataset:
+        return None
+    shape = np.asarray(dataset["height_above_ground"].values, np.float64) ** (-4 / 3)
+    weight = np.where(np.isfinite(shape) & np.isfinite(cn2) & (error > 0), 1 / np.where(error > 0, error, 1) ** 2, 0)
+    known = np.nan_to_num(shape)
+    if not (weight * known).any():
+        return None
+    return np.asarray(shape * np.sum(weight * known * np.nan_to_num(cn2)) / np.sum(weight * known**2))
 
 
 def compose_profile(figure: Figure, dataset: Dataset, batch: int) -> None:
     """Lay out the figure of the profile."""
-    draw_profile(figure.add_axes((0.105, 0.155, 0.88, 0.73)), dataset, batch)
+    draw_profile(figure.add_axes((0.105, 0.145, 0.88, 0.71)), dataset, batch)
 
 
 def describe_profile(dataset: Dataset, batch: int) -> str:
@@ -255,7 +318,7 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
 
     items = maps(dataset, batch)
     if not items:
-        _note(figure.add_axes((0.1, 0.1, 0.8, 0.8)), "no correlation maps")
+        note(figure.add_axes((0.1, 0.1, 0.8, 0.8)), "no correlation maps")
         return
     groups = [group for group in ([i for i in items if i.is_slope], [i for i in items if not i.is_slope]) if group]
     width, left, gap, bar = CORRELATION_SIZE[0], 0.86, 0.12, 0.85
@@ -368,7 +431,7 @@ def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0, *, near: float | 
     chosen = log_mu(scalar(dataset, "mu", batch))
     ax.set_xlabel(r"$\log_{10}\,\mu$   ($\mu$ in m$^{4/3}$)")
     if grid is None or curve is None or not np.isfinite(curve).any():
-        return _note(ax, "no criterion: μ was given")
+        return note(ax, "no criterion: μ was given")
     finite = np.isfinite(curve)
     grid, curve = grid[finite], curve[finite]
     lowest = curve.min()
@@ -385,7 +448,7 @@ def draw_criterion(ax: Axes, dataset: Dataset, batch: int = 0, *, near: float | 
         curve = curve / lowest if ratio else curve - lowest
         ax.set_ylabel(f"{name} / its minimum" if ratio else f"{name} − its minimum")
     if not grid.size:
-        return _note(ax, "μ is outside the curve")
+        return note(ax, "μ is outside the curve")
     ax.plot(grid, curve, "-", color=BLUE, marker=".", ms=6)
     if np.isfinite(chosen):
         ax.axvline(chosen, color=RED, lw=1.6, ls=(0, (5, 3)))
@@ -425,7 +488,7 @@ def draw_averaging_kernels(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     """Draw the averaging kernels of a batch as a matrix: a row per retrieved slice, a column per true slice."""
     kernel = of_batch(dataset, "averaging_kernel", batch)
     if kernel is None or not np.isfinite(kernel).any():
-        return _note(ax, "no averaging kernels")
+        return note(ax, "no averaging kernels")
     from .reading import borders
 
     rows = edges(dataset)
@@ -453,7 +516,7 @@ def draw_kernel_sums(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
     """Draw diagonal and sum of each averaging kernel against the distance of its slice."""
     kernel = of_batch(dataset, "averaging_kernel", batch)
     if kernel is None or not np.isfinite(kernel).any():
-        return _note(ax, "")
+        return note(ax, "")
     border = edges(dataset)
     centre = (border[1:] + border[:-1]) / 2
     ax.axvline(1, color=MUTED, lw=1)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...pipeline.comparison import Pair
-from ...pipeline.surroundings import FLUX_STATES
 from .reading import DAY, bounds, edges, listed, values
 from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, figure_style
 from .time_panels import _frame, _join, _visible, time_axis
@@ -235,6 +234,8 @@ def compose_heat_flux(figure: Figure, datasets: Sequence[Dataset]) -> None:
 
 def describe_heat_flux(datasets: Sequence[Dataset]) -> str:
     """Say the range of the heat flux and how it came about."""
+    from ...pipeline.surroundings import FLUX_STATES
+
     products = [dataset for dataset in datasets if "sensible_heat_flux" in dataset]
     if not products:
         return "No product holds a heat flux."

@@ -17,6 +17,9 @@ import numpy as np
 
 from ...pipeline.products import QUALITY_FLAGS
 from . import batch_panels as one
+from . import check_panels as check
+from . import flux_panels as flux
+from . import model_panels as model
 from . import time_panels as over
 from .reading import (
     LEVELS,
@@ -35,7 +38,8 @@ from .reading import (
 )
 from .style import figure_style
 from .svg import inline_svg
-from .words import NOTHING, clean, clock, days, interval, mapping, measured, number, offset, scientific, site_zone
+from .words import NOTHING, clean, clock, interval, mapping, measured, number, offset, scientific, site_zone
+from .words import days as period
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -107,9 +111,10 @@ BATCH_PANELS = (
         "How does Cn² vary along the line of sight?",
         "A step is one slice. The bar with a filled circle is the MAP error (1 sigma); the bar with an open "
         "diamond is the maximum-likelihood error, from the data alone: where it is much longer, the prior decides."
+        " The thick and the thin line between them are the shortest intervals of the posterior that hold 68 % and 95 %."
         " A bar with an arrow is a slice that the positivity constraint holds at zero; it marks zero plus two MAP "
         "errors, or the upper end of the 95 % interval where the product has one.",
-        (10.0, 4.6),
+        (10.0, 5.0),
         one.compose_profile,
         one.describe_profile,
     ),
@@ -145,6 +150,35 @@ BATCH_PANELS = (
         one.compose_kernels,
         one.describe_kernels,
     ),
+    BatchPanel(
+        "other_mu",
+        "How much does the profile depend on the regularisation?",
+        "The same data with a hundredth of the chosen μ, with the chosen one, and with a hundred times as much, with "
+        "MAP bars, on one scale. What all three show is in the data; what only one shows is the prior's, or noise.",
+        (10.0, 3.6),
+        model.compose_other_mu,
+        model.describe_other_mu,
+    ),
+    BatchPanel(
+        "checks",
+        "Do slopes and scintillation look like turbulence?",
+        "Left: variance per Zernike mode from the slopes against radial order; lines are Kolmogorov turbulence with "
+        "the direct r₀, after Noll, of the extended source. Points off the line at order 1 mean vibration or drift, "
+        "at the highest order noise or aliasing. Right: histogram of the log-amplitude; weak turbulence makes it "
+        "Gaussian.",
+        (10.0, 3.9),
+        check.compose_checks,
+        check.describe_checks,
+    ),
+    BatchPanel(
+        "vibration",
+        "Does the instrument vibrate?",
+        "Temporal spectrum of the slopes that all spots of both sources share. Turbulence falls smoothly; a machine "
+        "makes a line, marked where one is found. A line above half the frame rate appears at its alias.",
+        (10.0, 3.4),
+        check.compose_spectrum,
+        check.describe_spectrum,
+    ),
 )
 
 TIME_PANELS = (
@@ -164,8 +198,9 @@ TIME_PANELS = (
         "Does the profile agree with what the spots show directly?",
         "Open symbols are measured directly from fluxes and slopes, source by source; filled diamonds are computed"
         " from the retrieved profile, with aperture and source averaging in the index. Both hold at the "
-        "instrument's wavelength. Where they differ, the profile misses or invents turbulence.",
-        (10.0, 5.6),
+        "instrument's wavelength. Where they differ, the profile misses or invents turbulence; by how much, the lowest "
+        "panel says.",
+        (10.0, 6.6),
         over.compose_strength,
         over.describe_strength,
         ("scintillation_index_profile", "scintillation_index_direct", "r0_profile", "r0_direct"),
@@ -181,6 +216,70 @@ TIME_PANELS = (
         ("chi2_reduced", "mu"),
     ),
     TimePanel(
+        "selection",
+        "How sure is the choice of the regularisation?",
+        "A column is the criterion of one batch, relative to its own minimum: the brighter, the closer to it. The line "
+        "with open diamonds is the chosen μ. A broad bright band means that the data hardly tell.",
+        (10.0, 4.0),
+        over.compose_selection,
+        over.describe_selection,
+        ("criterion",),
+    ),
+    TimePanel(
+        "averages",
+        "What would a scintillometer see?",
+        "Mean of Cn² along the path with its 68 % interval, and for each scintillometer that the recording's header "
+        "names, the mean with that instrument's weight.",
+        (10.0, 4.0),
+        over.compose_averages,
+        over.describe_averages,
+        ("cn2_path_mean",),
+    ),
+    TimePanel(
+        "scintillometers",
+        "Do profiles and scintillometers agree?",
+        "Solid lines with bars: the profiles averaged along the path as each scintillometer weights them, "
+        "with the errors of their posterior. Dotted lines with open symbols: what the instruments measured in the same "
+        "time. Below, one against the other; the grey line is equality.",
+        (10.0, 7.6),
+        flux.compose_agreement,
+        flux.describe_agreement,
+        ("cn2_scintillometer",),
+    ),
+    TimePanel(
+        "height",
+        "Does the turbulence follow the height above ground?",
+        "The solid steps are the median profile of the first product. The dashed ones are what free convection over "
+        "uniform ground would make of the same Fried parameter; the terrain decides where they rise. Below: height of "
+        "the line of sight above the ground.",
+        (10.0, 5.2),
+        flux.compose_height_model,
+        flux.describe_height_model,
+        ("cn2_height_model",),
+    ),
+    TimePanel(
+        "heat_flux",
+        "How much heat does the ground give to the air?",
+        "Sensible heat flux, upward, of each slice over time: red where the ground warms the air, blue where it cools "
+        "it. Blank where there is no solution or no weather. Below: the median of each slice.",
+        (10.0, 6.4),
+        flux.compose_heat_flux,
+        flux.describe_heat_flux,
+        ("sensible_heat_flux",),
+    ),
+    TimePanel(
+        "response",
+        "What do the data answer to, and from where?",
+        "Above: correlation that Cn²dz = 1 m^(1/3) in one slice makes, along dy at dx = 0; the numbers count the "
+        "slices from the pupil. The width of the scintillation grows with distance, that of the slopes hardly does. "
+        "Below: variance at zero separation against distance, relative to its largest. Slopes see what is near, "
+        "scintillation the middle of the path; beyond the dotted line the two sources share no turbulence.",
+        (10.0, 7.2),
+        model.compose_response,
+        model.describe_response,
+        ("response_intensity",),
+    ),
+    TimePanel(
         "quality",
         "Which batches need care?",
         "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number "
@@ -190,6 +289,36 @@ TIME_PANELS = (
         over.describe_quality,
     ),
 )
+
+
+@dataclass(frozen=True)
+class Day:
+    """A day in the index of a long campaign.
+
+    Parameters
+    ----------
+    name : str
+        ``2012-09-14``.
+    file : str
+        File name of its page.
+    count : int
+        Batches.
+    quality : tuple of int
+        How many are good, usable with care, bad.
+    cn2 : float
+        Median of the mean along the path, m^(-2/3).
+    """
+
+    name: str
+    file: str
+    count: int
+    quality: tuple[int, int, int]
+    cn2: float
+
+    @property
+    def shown(self) -> tuple[str, str]:
+        """`cn2` as text and as what the table is sorted by."""
+        return number(self.cn2, 3), repr(self.cn2) if np.isfinite(self.cn2) else ""
 
 
 def figure(panel: BatchPanel | TimePanel, datasets: Dataset | Sequence[Dataset], batch: int = 0) -> Figure:
@@ -219,7 +348,8 @@ def _draw(panel: BatchPanel | TimePanel, products: Sequence[Dataset], batch: int
     return drawn
 
 
-def _says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
+def says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
+    """Whether a panel over time has anything to show."""
     found = [values(dataset, name) for dataset in products for name in panel.variables]
     return not panel.variables or any(value is not None and bool(np.isfinite(value).any()) for value in found)
 
@@ -227,7 +357,7 @@ def _says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
 def _markup(panel: BatchPanel | TimePanel, prefix: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
     text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
     svg = ""
-    if isinstance(panel, BatchPanel) or _says_something(panel, products):
+    if isinstance(panel, BatchPanel) or says_something(panel, products):
         with figure_style():
             svg = inline_svg(_draw(panel, products, batch), prefix, panel.title, text)
     return {"title": panel.title, "reading": panel.reading, "text": text, "svg": svg, "key": panel.key}
@@ -253,7 +383,8 @@ def _spread(found: Sequence[float], factor: float = 1.0) -> tuple[str, str]:
     ), f"median; {number(float(finite.min()), 3)} to {number(float(finite.max()), 3)}"
 
 
-def _key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
+def key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
+    """Name, value, unit and remark of what everybody asks for first."""
     batches = [(dataset, batch) for dataset in products for batch in range(dataset.sizes["time"])]
 
     def number_of(name: str, words: str, unit: str, factor: float = 1.0) -> dict[str, str]:
@@ -314,6 +445,47 @@ def path_mean(dataset: Dataset, batch: int) -> tuple[float, float]:
     # A product holds no correlation of its errors. Those of neighbouring slices are mostly negative, as what one slice
     # loses the next one gains, so that independence exaggerates rather than flatters.
     return float(share @ cn2), float(np.sqrt(np.sum((share * error) ** 2))) if error is not None else float("nan")
+
+
+def geometry(products: Sequence[Dataset]) -> list[dict[str, str]]:
+    """What the arrangement of pupil, path and sources allows: name, value, unit, remark."""
+    found: dict[tuple[str, ...], None] = {}
+    for dataset in products:
+        rows = [("Path length", *_quantity(dataset.attrs.get("path_length")), "")]
+        rows.append(("Subaperture", *_quantity(dataset.attrs.get("subaperture_size"), 100, "cm"), ""))
+        if "dy" in dataset and dataset.sizes["dy"] > 1:
+            dy = np.asarray(dataset["dy"].values, dtype=np.float64)
+            rows.append(("Pupil along y", number(100 * ((dy[-1] - dy[0]) / 2 + dy[1] - dy[0]), 3), "cm", ""))
+        for name, words, remark in (
+            ("z_max", "z_max", "triangulation ends here: beyond, the two sources share no turbulence"),
+            ("z_first", "Resolution near the pupil", "where the sources' patterns move by one subaperture"),
+        ):
+            value = float(dataset[name].values) if name in dataset else float("nan")
+            if np.isfinite(value):
+                rows.append((words, number(value, 4), "m", remark))
+        if "fresnel_scale" in dataset:
+            scale = 100 * np.asarray(dataset["fresnel_scale"].values, dtype=np.float64)
+            rows.append(("Fresnel scale on the pupil", f"{number(float(scale[0]), 3)} to {number(float(scale[-1]), 3)}",
+                         "cm", "size of the scintillation from the first and from the last slice"))  # fmt: skip
+        if "resolution_length" in dataset:
+            length = np.asarray(dataset["resolution_length"].values, dtype=np.float64)
+            if np.isfinite(length).any():
+                with np.errstate(all="ignore"):
+                    median = np.nanmedian(length[np.isfinite(length).any(axis=1)], axis=0)
+                rows.append(("Resolution of the profiles", f"{number(float(np.nanmin(median)), 3)} to "
+                             f"{number(float(np.nanmax(median)), 3)}", "m",
+                             "length of path that a slice stands for, median"))  # fmt: skip
+        found |= dict.fromkeys(row for row in rows if row[1])
+    return [dict(zip(("name", "value", "unit", "remark"), row, strict=True)) for row in found]
+
+
+def _quantity(value: object, factor: float = 1.0, unit: str = "m") -> tuple[str, str]:
+    """Number and unit of a length written as text in metres; empty where it is none."""
+    amount, _, written = str(value).partition(" ")
+    try:
+        return (number(factor * float(amount), 4), unit) if written == "m" else ("", "")
+    except ValueError:
+        return "", ""
 
 
 #: Columns of the table of batches: heading, unit, tooltip.
@@ -416,7 +588,7 @@ def _flat(value: object, depth: int = 0) -> str:
     return f"({text})" if depth and isinstance(value, dict | list) else text
 
 
-def _software(products: Sequence[Dataset]) -> str:
+def software(products: Sequence[Dataset]) -> str:
     """Name, version and commit of the software that made the products."""
     found = []
     for dataset in products:
@@ -434,7 +606,14 @@ def _policy(*contents: str) -> list[str]:
     ]
 
 
-def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, most_batches: int = 12) -> str:
+def render(
+    datasets: Dataset | Iterable[Dataset],
+    *,
+    title: str | None = None,
+    most_batches: int = 6,
+    days: Sequence[Day] = (),
+    back: str = "",
+) -> str:
     """Make the report of one or more products as one self-contained HTML page.
 
     Parameters
@@ -445,6 +624,10 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
         Heading; by default the campaign.
     most_batches : int
         Batches with figures of their own, picked evenly among those that have a profile.
+    days : sequence of Day
+        Pages with the batches, one a day; this page has none then, but an index of them.
+    back : str
+        File name of the page with the index of days, where this one is of a day.
 
     Returns
     -------
@@ -479,6 +662,7 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
     raised = int(np.bitwise_or.reduce(np.concatenate([flags(dataset) for dataset in products])))
 
     batches = [(i, j) for i, dataset in enumerate(products) for j in range(dataset.sizes["time"])]
+    most_batches = 0 if days else most_batches
     chosen = [batches[n] for n in pick(np.concatenate([has_profile(dataset) for dataset in products]), most_batches)]
     shown = []
     for n, (i, j) in enumerate(chosen):
@@ -487,15 +671,15 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
             "label": f"{' to '.join(interval(begin, end))} UTC",
             "quality": LEVELS[levels(products[i])[j]],
             "flags": flag_names(int(flags(products[i])[j])),
-            "panels": [_markup(panel, f"b{n}{panel.key[:2]}", [products[i]], j) for panel in BATCH_PANELS],
+            "panels": [_markup(panel, f"b{n}{panel.key}", [products[i]], j) for panel in BATCH_PANELS],
             "rows": one.profile_rows(products[i], j),
         })  # fmt: skip
 
     several = len(batches) > 1
     panels = [
-        _markup(panel, f"t{panel.key[:2]}", products)
+        _markup(panel, f"t{panel.key}", products)
         for panel in TIME_PANELS
-        if panel.key != "map" or (several and _says_something(panel, products))
+        if panel.key != "map" or (several and says_something(panel, products))
     ]
     documents = _documents(products)
     environment = Environment(
@@ -518,19 +702,22 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
     for item in shown:
         item["panels"] = marked(item["panels"])  # type: ignore[arg-type]
     script_policy, style_policy = _policy(source["report.js"], source["report.css"])
-    heading = title if title is not None else f"Cn² along the line of sight: {', '.join(campaigns)}"
+    named = title if title is not None else heading(products)
     return environment.from_string(source["report.html"]).render(
         script=Markup(source["report.js"]),
         style=Markup(source["report.css"]),
         script_policy=Markup(script_policy),
         style_policy=Markup(style_policy),
-        title=heading,
+        title=named,
         campaigns=campaigns,
         archives=archives,
         utc=interval(start, stop),
         local=None if zone is None else interval(start, stop, zone),
         zone=None if zone is None else f"{zone.key}, {offset(start, zone)}",
-        period=days(start, stop),
+        period=period(start, stop),
+        days=days,
+        back=back,
+        geometry=geometry(products),
         count=len(batches),
         settings=_settings(products),
         path=list(dict.fromkeys(_path(dataset) for dataset in products)),
@@ -548,14 +735,14 @@ def render(datasets: Dataset | Iterable[Dataset], *, title: str | None = None, m
             for name, (bit, severity, meaning) in QUALITY_FLAGS.items()
             if raised & bit
         ],
-        numbers=_key_numbers(products),
+        numbers=key_numbers(products),
         without=len(batches) - int(np.concatenate([has_profile(dataset) for dataset in products]).sum()),
         panels=marked(panels),
         batches=shown,
         columns=COLUMNS,
-        rows=_table(products),
+        rows=[] if days else _table(products),
         documents=documents,
-        software=_software(products),
+        software=software(products),
         method=METHOD,
     )
 
@@ -565,9 +752,12 @@ def write_report(
     path: str | os.PathLike[str],
     *,
     title: str | None = None,
-    most_batches: int = 12,
-) -> Path:
-    """Write the report of one or more products; what stood under that name is replaced only when the page is complete.
+    most_batches: int = 6,
+) -> list[Path]:
+    """Write the report of one or more products; what stood under a name is replaced only when the page is complete.
+
+    Batches of more than :data:`DAYS` days (of the site, where its time zone is known) have a page a day,
+    ``NAME-2012-09-14.html``, and ``NAME.html`` is their index.
 
     Parameters
     ----------
@@ -578,11 +768,51 @@ def write_report(
 
     Returns
     -------
-    Path
-        The file.
+    list of Path
+        The files; the first is the one to open.
     """
-    target = Path(path)
-    text = render(datasets, title=title, most_batches=most_batches)
+    target, products = Path(path), listed(datasets)
+    by_day = _by_day(products)
+    if len(by_day) <= DAYS:
+        return [_write(target, render(products, title=title, most_batches=most_batches))]
+    found = []
+    for name, parts in by_day.items():
+        page = target.with_name(f"{target.stem}-{name}{target.suffix}")
+        of_day = f"{title or heading(products)}: {name}"
+        _write(page, render(parts, title=of_day, most_batches=most_batches, back=target.name))
+        level = np.concatenate([levels(part) for part in parts])
+        means = [path_mean(part, i)[0] for part in parts for i in range(part.sizes["time"])]
+        known = [mean for mean in means if np.isfinite(mean)]
+        found.append(
+            Day(name, page.name, level.size, tuple(int((level == i).sum()) for i in range(3)),  # type: ignore[arg-type]
+                float(np.median(known)) if known else float("nan"))
+        )  # fmt: skip
+    index = _write(target, render(products, title=title, days=found))
+    return [index, *(target.with_name(day.file) for day in found)]
+
+
+#: Up to so many days of batches stand on one page.
+DAYS = 2
+
+
+def _by_day(products: Sequence[Dataset]) -> dict[str, list[Dataset]]:
+    """Batches by the day, at the site where its time zone is known, on which they start."""
+    found: dict[str, list[Dataset]] = {}
+    for dataset in products:
+        zone = site_zone(products[0].attrs)
+        names = [clock(int(time), *([] if zone is None else [zone]))[:10] for time in bounds(dataset)[:, 0]]
+        for name in dict.fromkeys(names):
+            found.setdefault(name, []).append(dataset.isel(time=[i for i, day in enumerate(names) if day == name]))
+    return dict(sorted(found.items()))
+
+
+def heading(products: Sequence[Dataset]) -> str:
+    """What a report is called by default."""
+    campaigns = dict.fromkeys(str(dataset.attrs.get("campaign", "unnamed campaign")) for dataset in products)
+    return f"Cn² along the line of sight: {', '.join(campaigns)}"
+
+
+def _write(target: Path, text: str) -> Path:
     target.parent.mkdir(parents=True, exist_ok=True)
     temporary = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:

@@ -19,6 +19,7 @@ from .reading import (
     LEVELS,
     Floats,
     Series,
+    borders,
     bounds,
     edges,
     flag_names,
@@ -31,7 +32,7 @@ from .reading import (
     values,
 )
 from .style import BLUE, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
-from .words import clock, days, month, number, offset, scientific, site_zone
+from .words import clean, clock, days, month, number, offset, scientific, site_zone
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -312,14 +313,37 @@ def _draw_pair(ax: Axes, products: list[Dataset], name: str, label: str, factor:
     return time_axis(ax, products)
 
 
+def draw_relative(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw by how much scintillation index and Fried parameter of the profile differ from the direct ones, in %."""
+    products = listed(datasets)
+    ax.axhline(0, color=MUTED, lw=1.2)
+    reach = 10.0
+    for name, label, colour, marker, dashes in (
+        ("scintillation_index", r"$\sigma_I^2$", BLUE, "D", "-"),
+        ("r0", r"$r_0$", PURPLE, "^", (0, (5, 2))),
+    ):
+        direct, profile = series(products, f"{name}_direct"), series(products, f"{name}_profile")
+        if direct is None or profile is None or direct.values.size != profile.values.size:
+            continue
+        line = profile.mapped(lambda values, direct=direct: 100 * (values / direct.values - 1))  # type: ignore[misc]
+        _follow(ax, line, f"{label}: profile / direct − 1", color=colour, marker=marker, ls=dashes, ms=5)
+        if np.isfinite(line.values).any():
+            reach = max(reach, float(np.nanpercentile(np.abs(line.values), 98)))
+    ax.set_ylim(-1.15 * reach, 1.15 * reach)
+    ax.grid(axis="y")
+    ax.set_ylabel("difference (%)")
+    return time_axis(ax, products)
+
+
 def compose_strength(figure: Figure, datasets: Sequence[Dataset]) -> None:
-    """Lay out scintillation index and Fried parameter over time."""
-    above, below = _frame(figure, datasets, [1.9, 1.9], head=0.3)
+    """Lay out scintillation index and Fried parameter over time, and their relative differences."""
+    above, below, relative = _frame(figure, datasets, [1.7, 1.7, 1.3], head=0.55)
     draw_scintillation(above, datasets)
     draw_fried_parameter(below, datasets)
-    _join((above, below))
+    draw_relative(relative, datasets)
+    _join((above, below, relative))
     handles = {}
-    for ax in (above, below):
+    for ax in (above, below, relative):
         handles.update(dict(zip(*reversed(ax.get_legend_handles_labels()), strict=True)))
     figure.legend(
         list(handles.values()), list(handles), loc="upper left", bbox_to_anchor=(0.09, 1.0), ncol=3, borderaxespad=0.1
@@ -408,6 +432,109 @@ def describe_fit(datasets: Sequence[Dataset]) -> str:
             low, middle, high = (number(float(value), 3) for value in (found.min(), np.median(found), found.max()))
             parts.append(f"{words}: {middle}" if found.size == 1 else f"{words}: median {middle}, from {low} to {high}")
     return "; ".join(parts) + "." if parts else "No batch has these numbers."
+
+
+def draw_selection(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw the criterion of every batch against log10(mu) and time, relative to its minimum, with the chosen mu."""
+    from matplotlib.colors import LogNorm
+
+    products = listed(datasets)
+    image = None
+    columns = _visible([bounds(dataset) / DAY for dataset in products])
+    for dataset, limit in zip(products, columns, strict=True):
+        curve = values(dataset, "criterion")
+        if curve is None or curve.shape[1] < 2:
+            continue
+        with np.errstate(invalid="ignore"):
+            lowest = np.nanmin(np.where(np.isfinite(curve), curve, np.inf), axis=1, keepdims=True)
+            # GCV and its like are positive, and their ratio counts; of logarithms the difference does.
+            excess = curve / lowest - 1 if (lowest[np.isfinite(lowest)] > 0).all() else curve - lowest
+        edge = borders(np.asarray(dataset["log_mu_grid"].values, np.float64))
+        shown = np.ma.masked_invalid(np.maximum(excess, 1e-4))
+        for first, last in _uninterrupted(limit):
+            image = ax.pcolormesh(
+                np.append(limit[first:last, 0], limit[last - 1, 1]), edge, shown[first:last].T,
+                norm=LogNorm(1e-4, 1), cmap=f"{SEQUENTIAL}_r", rasterized=True, shading="flat",
+            )  # fmt: skip
+    line = series(products, "mu")
+    if line is not None:
+        _follow(ax, line.mapped(np.log10), "chosen", color=RED, marker="D", ls="-", ms=5, mfc=PAPER)
+    ax.set_ylabel(r"$\log_{10}\,\mu$")
+    time_axis(ax, products)
+    if image is not None:
+        bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
+        bar.set_label("criterion / minimum − 1")
+        bar.outline.set_linewidth(0.6)
+    return ax
+
+
+def compose_selection(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out the criteria over time."""
+    draw_selection(_frame(figure, datasets, [2.6], right=0.75)[0], datasets)
+
+
+def describe_selection(datasets: Sequence[Dataset]) -> str:
+    """Say how much the chosen mu varies."""
+    line = series(datasets, "mu")
+    found = np.empty(0) if line is None else np.log10(line.values[line.values > 0])
+    if not found.size:
+        return "No batch has a chosen μ."
+    text = f"log₁₀ μ: {number(float(found.mean()), 4)}"
+    return text + (f" ± {number(float(found.std()), 2)} (mean and deviation of {found.size} batches)." if found.size > 1
+                   else ".")  # fmt: skip
+
+
+#: Marker, dashes and colour of the averages along the path.
+_AVERAGES = (("s", (0, (5, 2)), GREEN), ("o", (0, (1, 1.5)), RED), ("^", (0, (6, 2, 1, 2)), PURPLE))
+
+
+def draw_averages(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
+    """Draw the mean of Cn2 along the path with its 68 % interval, and as scintillometers on the path weight it."""
+    products = listed(datasets)
+    mean = series(products, "cn2_path_mean")
+    low, high = (series(products, "cn2_path_mean_interval_68", end) for end in (0, 1))
+    positive = []
+    if mean is not None:
+        if low is not None and high is not None:
+            ax.fill_between(mean.days, low.values, high.values, color=BLUE, alpha=0.25, lw=0, label="its 68 % interval")
+            if mean.values.size <= MARKED:
+                ax.vlines(mean.days, low.values, high.values, color=BLUE, lw=1.4)
+        _follow(ax, mean, "mean along the path", color=BLUE, marker="D", ls="-", ms=5)
+        positive.append(mean.values)
+    count = max(dataset.sizes.get("scintillometer", 0) for dataset in products)
+    named = next((d for d in products if d.sizes.get("scintillometer", 0) == count and count), None)
+    for component in range(count):
+        line = series(products, "cn2_path_average", component)
+        marker, dashes, colour = _AVERAGES[component % len(_AVERAGES)]
+        name = clean(named["scintillometer"].values[component])[:24].replace("$", r"\$") if named is not None else ""
+        _follow(ax, line, f"as {name} weights it", color=colour, marker=marker, mfc=PAPER, ls=dashes, lw=1.6)
+        positive += [line.values] if line is not None else []
+    found = np.concatenate(positive) if positive else np.empty(0)
+    if (found > 0).any():
+        ax.set_yscale("log")
+    ax.grid(axis="y", which="both")
+    ax.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
+    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.0), fontsize=11)
+    return time_axis(ax, products)
+
+
+def compose_averages(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out averages along the path."""
+    draw_averages(_frame(figure, datasets, [2.6], left=1.25)[0], datasets)
+
+
+def describe_averages(datasets: Sequence[Dataset]) -> str:
+    """Say the range of the mean along the path."""
+    line = series(datasets, "cn2_path_mean")
+    found = np.empty(0) if line is None else line.values[np.isfinite(line.values)]
+    if not found.size:
+        return "No batch has a mean along the path."
+    if found.size == 1:
+        return f"Mean of Cn² along the path: {scientific(float(found[0]))} m^(-2/3)."
+    return (
+        f"Mean of Cn² along the path: median {scientific(float(np.median(found)))} m^(-2/3), from "
+        f"{scientific(float(found.min()))} to {scientific(float(found.max()))}."
+    )
 
 
 def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:

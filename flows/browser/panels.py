@@ -56,7 +56,7 @@ def panel_markup(key: str, products: Sequence[Dataset], batch: int = 0) -> dict[
     drawn = ""
     if not _empty(panel, products):
         with figure_style():
-            drawn = inline_svg(figure(panel, products, batch), f"p{key[:2]}", panel.title, text)
+            drawn = inline_svg(figure(panel, products, batch), f"p-{key}", panel.title, text)
     return {"key": key, "title": panel.title, "reading": panel.reading, "text": text, "svg": drawn}
 
 

@@ -162,7 +162,7 @@ def test_wrong_usage(main_here: Main, arguments: list[str]) -> None:
 
 COMMANDS = [
     ["init"], ["inspect"], ["simulate"], ["plan"], ["run"], ["report"], ["catalog"], ["plugins"], ["response"],
-    ["invert"], ["catalog", "ls"], ["catalog", "show"], ["catalog", "export"], ["catalog", "verify"],
+    ["invert"], ["catalog", "ls"], ["catalog", "show"], ["export"], ["catalog", "verify"],
     ["catalog", "gc"], ["catalog", "runs"], ["plugins", "ls"], ["plugins", "describe"],
 ]  # fmt: skip
 
