@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from ..pipeline.markup import table
 from ..pipeline.parameters import FORMAT, FORMAT_VERSION, Header, overlay, spot_faults, text_faults
 from ..pipeline.units import QuantityError, faults, parse, safe
 from .archive_codecs import (
@@ -183,6 +184,11 @@ class Archive:
     gaps: NDArray[np.int64] = field(repr=False)
     missing_chunks: tuple[str, ...]
     _frames: StoredArray = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        content = {key: value for key, value in describe(self).items() if key not in ("attributes", "notes", "mask")}
+        return table(f"Archive {self.header.campaign}/{self.header.archive}", (), content.items())
 
     @property
     def n_frames(self) -> int:
