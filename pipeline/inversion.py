@@ -32,6 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize
 
 from . import posterior, uncertainty
+from .markup import table
 
 if TYPE_CHECKING:
     from .geometry import SliceGrid
@@ -1050,6 +1051,17 @@ class Profile:
     residual: Floats
     n_data: int
     resolution_length: Floats
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        rows = [
+            (number, f"{cn2:.2e}", f"{bar:.1e}", f"{data:.1e}", "at zero" if bound else "")
+            for number, (cn2, bar, data, bound) in enumerate(
+                zip(self.cn2, self.error_map, self.error_ml, self.at_bound, strict=True)
+            )
+        ]
+        caption = f"Cn2 profile ({self.estimator}), m^(-2/3); chi2 per datum {self.chi2_reduced:.2f}"
+        return table(caption, ("slice", "Cn2", "MAP bar", "ML bar", ""), rows)
 
     @property
     def mu(self) -> float:
