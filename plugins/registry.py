@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from ..pipeline.markup import table
 from .contract import (
     HyperparameterSelectorBase,
     Plugin,
@@ -122,7 +123,22 @@ def _distribution(point: EntryPoint) -> str:
     return f"{dist.name} {dist.version}" if dist is not None else "unknown distribution"
 
 
-def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> dict[str, Entry]:
+class Entries(dict[str, Entry]):
+    """Registered plugins by name, as :func:`entries` finds them."""
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: every plugin, loaded or with the reason why not."""
+        rows = []
+        for name, entry in self.items():
+            try:
+                about = (entry.load().__doc__ or "").strip().partition("\n")[0]
+            except PluginError as error:
+                about = f"cannot be loaded: {error}"
+            rows.append((entry.kind, name, entry.distribution, about))
+        return table("Plugins", ("kind", "name", "from", "what"), rows)
+
+
+def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> Entries:
     """All registered plugins of one kind, by name, without loading any.
 
     Parameters
@@ -134,8 +150,8 @@ def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> dict[str, 
 
     Returns
     -------
-    dict of str to Entry
-        Sorted by name.
+    Entries
+        A dictionary from name to :class:`Entry`, sorted by name.
 
     Raises
     ------
@@ -143,7 +159,7 @@ def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> dict[str, 
         Two distributions register the same name.
     """
     group = KINDS[kind][0]
-    found: dict[str, Entry] = {}
+    found = Entries()
     faults = []
     for point in sorted(entry_points(group=group) if points is None else points, key=lambda p: (p.name, p.value)):
         entry = Entry(kind, point.name, _distribution(point), point)
