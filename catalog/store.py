@@ -18,6 +18,7 @@ import numpy as np
 import sqlalchemy as sa
 
 from ..pipeline.lineage import Key
+from ..pipeline.markup import table
 from ..pipeline.units import safe
 from . import provenance as records
 from .database import Database, location, plain_text
@@ -446,6 +447,60 @@ class Catalog(RunLog, Releases, Upkeep):
     def open(self, row: ProductRow) -> Dataset:
         """Read a product; see :func:`coslidar.catalog.products.open_product`."""
         return open_product(row.path)
+
+    def profiles(
+        self,
+        *,
+        campaign_name: str | None = None,
+        archive_name: str | None = None,
+        lineage_key: str | None = None,
+        quality_level: int = 1,
+    ) -> Dataset:
+        """Profiles of many archives as one dataset, in the order of time.
+
+        Parameters
+        ----------
+        campaign_name, archive_name : str, optional
+            Only those.
+        lineage_key : str, optional
+            Only products whose key begins so; the newest product of each archive where it is absent.
+        quality_level : int
+            Only batches of this level or better: 0 good, 1 usable with care, 2 bad.
+
+        Returns
+        -------
+        xarray.Dataset
+            As :func:`coslidar.catalog.export.join` makes it.
+
+        Raises
+        ------
+        CatalogError
+            There is none.
+        coslidar.catalog.export.ExportError
+            They do not fit together.
+        """
+        from .export import join
+
+        rows = self.products(campaign_name=campaign_name, archive_name=archive_name, lineage_key=lineage_key)
+        newest = {row.archive_identity: row for row in sorted(rows, key=lambda row: (row.published, row.id))}
+        opened = [self.open(row) for row in newest.values()]
+        good = [dataset.isel(time=dataset["quality_level"].values <= quality_level) for dataset in opened]
+        found = [dataset for dataset in good if dataset.sizes["time"]]
+        if not found:
+            raise CatalogError(f"{safe(str(self.root))}: no batch answers; quality_level=2 takes the bad ones too")
+        return join(found)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: campaigns, and how much there is of each."""
+        rows = self.products()
+        lines = []
+        for name in dict.fromkeys(row.campaign for row in rows):
+            mine = [row for row in rows if row.campaign == name]
+            span = [np.datetime64(time, "ns").astype("datetime64[s]") for time in (mine[0].start, mine[-1].stop)]
+            archives = len({row.archive_identity for row in mine})
+            lines.append((name, archives, len(mine), sum(row.batches for row in mine), *span))
+        heading = ("campaign", "archives", "products", "batches", "from (UTC)", "to (UTC)")
+        return table(f"Catalog {self.root}", heading, lines)
 
     def provenance(self, row: ProductRow) -> dict[str, Any]:
         """PROV-JSON of a product together with the run that published it."""
