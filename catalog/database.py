@@ -98,7 +98,7 @@ def database_url(text: str, origin: str = "the database URL") -> URL:
     """
     try:
         url = make_url(text)
-    except sa.exc.ArgumentError:
+    except (sa.exc.ArgumentError, ValueError):  # the second where a port is no number
         url = None
     if url is None or url.get_backend_name() not in ("postgresql", "sqlite"):
         # The text is not repeated: it may hold a password.
@@ -384,3 +384,12 @@ def plain_text(value: object, limit: int = 10_000) -> str:
     """Text that every database takes: no NUL, no half characters, not longer than `limit`."""
     cut = str(value)[:limit]
     return cut.encode("utf-8", "backslashreplace").decode("utf-8").replace("\0", "\\0")
+
+
+def plain_json(value: Any) -> Any:
+    """JSON whose texts every database takes, and none of them long; see :func:`plain_text`."""
+    if isinstance(value, str):
+        return plain_text(value)
+    if isinstance(value, Mapping):
+        return {plain_text(key, 200): plain_json(item) for key, item in value.items()}
+    return [plain_json(item) for item in value] if isinstance(value, (list, tuple)) else value

@@ -14,7 +14,7 @@ import sqlalchemy as sa
 
 from ..pipeline.lineage import checkout
 from . import provenance as records
-from .database import Database, plain_text
+from .database import Database, plain_json, plain_text
 from .heartbeats import alive
 from .rows import FailureRow, RunRow
 from .tables import failure, run
@@ -63,7 +63,7 @@ class RunLog:
                     command=plain_text(command if command is not None else " ".join(sys.argv)),
                     commit=str(checkout()),
                     software=records.software(),
-                    configuration=dict(configuration or {}),
+                    configuration=plain_json(configuration or {}),
                 )
             )
         return identity

@@ -21,7 +21,7 @@ from ..pipeline.lineage import Key
 from ..pipeline.markup import table
 from ..pipeline.units import safe
 from . import provenance as records
-from .database import Database, location, plain_text
+from .database import Database, location, plain_json, plain_text
 from .entries import batch_rows, plugin_rows, timezone_of
 from .products import ProductError, check_digest, check_name, open_product, product_bytes, sync_folder, write_temporary
 from .query import QueryError, understand
@@ -251,7 +251,7 @@ class Catalog(RunLog, Releases, Upkeep):
             "name": name,
             "identity": identity,
             "url": plain_text(url),
-            "header": dict(header or {}),
+            "header": plain_json(header or {}),
         }
         self.database.insert_new(connection, archive, values, archive.c.id)
         known = sa.select(archive.c.id, archive.c.campaign_id, archive.c.name).where(archive.c.identity == identity)

@@ -22,6 +22,12 @@ KINDS = [
 ]
 
 
+def use_server(url: str) -> None:
+    """Take this server instead of the one of the environment."""
+    global SERVER
+    SERVER = url
+
+
 @contextmanager
 def database_of(kind: str, folder: Path) -> Iterator[str]:
     """URL of an empty database, gone afterwards."""

@@ -6,8 +6,6 @@ import hashlib
 import json
 import os
 import pickle
-import random
-import signal
 import sqlite3
 import subprocess
 import sys
@@ -365,106 +363,6 @@ def test_threads_that_publish_the_same(catalog):
     assert len({outcome.row for outcome in outcomes}) == 1
     assert len(files(catalog)) == 1
     whole(catalog)
-
-
-# Imports once, then forks publishers on command: a round costs milliseconds, not the second of an import.
-_PUBLISHERS = """
-import json, os, random, sys
-sys.path.insert(0, sys.argv[1])
-from made_products import key, product
-from coslidar.catalog.store import Catalog
-import coslidar.pipeline.lineage as lineage
-
-made = product()
-def variant(number):
-    changed = key(number)
-    document = json.dumps(lineage.document(changed), sort_keys=True)
-    return made.assign_attrs(lineage_key=str(changed), lineage=document)
-
-for line in sys.stdin:
-    seed, count = map(int, line.split())
-    for number in range(count):
-        child = os.fork()
-        if child == 0:
-            random.seed(seed * 100 + number)
-            with Catalog(sys.argv[2]) as catalog:
-                while True:
-                    # Four writers in a range of few numbers: they meet.
-                    wanted = seed * 10 + random.randrange(40)
-                    new = catalog.publish(variant(wanted)).new
-                    if new:
-                        os.write(1, f"published {wanted}\\n".encode())
-        print("pid", child, flush=True)
-"""
-
-
-def kill_rounds(root, rounds, publishers):
-    """Start publishers, kill them all at a random moment, look at what is left; over and over."""
-    dice = random.Random(2012)
-    acknowledged, orphans = set(), 0
-    with subprocess.Popen(
-        [sys.executable, "-c", _PUBLISHERS, HELPERS, str(root)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as nursery:
-        try:
-            for number in range(rounds):
-                nursery.stdin.write(f"{number} {publishers}\n")
-                nursery.stdin.flush()
-                children = []
-                while len(children) < publishers:
-                    word, value = nursery.stdout.readline().split()
-                    if word == "pid":
-                        children.append(int(value))
-                    else:
-                        acknowledged.add(int(value))
-                time.sleep(dice.uniform(0.02, 0.4))
-                for child in children:
-                    os.kill(child, signal.SIGKILL)
-                for child in children:
-                    while (state := process_state(child)) not in ("Z", ""):
-                        assert state
-                        time.sleep(0.002)
-                with Catalog(root) as catalog:
-                    rows = whole(catalog)
-                    orphans += len(catalog.collect(older_than=0))
-                    assert set(files(catalog)) == {row.path for row in rows}
-        finally:
-            nursery.stdin.close()
-            for line in nursery.stdout:
-                acknowledged.add(int(line.split()[1])) if line.startswith("published") else None
-            nursery.terminate()
-    with Catalog(root) as catalog:
-        published = {row.lineage_key for row in whole(catalog)}
-    missing = [number for number in acknowledged if str(key(number)) not in published]
-    assert missing == []
-    return len(published), orphans
-
-
-def process_state(process):
-    try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return ""
-
-
-needs_proc = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="looks for zombies in /proc")
-
-
-@needs_proc
-def test_killed_publishers(tmp_path):
-    published, _ = kill_rounds(tmp_path / "catalog", rounds=8, publishers=2)
-    assert published > 0
-
-
-@needs_proc
-@pytest.mark.slow
-def test_killed_publishers_for_long(tmp_path):
-    published, orphans = kill_rounds(tmp_path / "catalog", rounds=60, publishers=4)
-    assert published > 60
-    # Not one half-written file in 60 rounds would mean that the kills came at harmless moments.
-    assert orphans > 0
 
 
 # --- database ----------------------------------------------------------------------------------------------
