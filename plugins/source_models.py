@@ -84,7 +84,8 @@ class Point(SourceModelBase):
 class Disc(SourceModelBase):
     """Uniform disc.
 
-    P~(f) = 2 J1(w) / w with w = pi D |f| (Goodman, Introduction to Fourier Optics, circular aperture). From
+    P~(f) = 2 J1(w) / w with w = pi D |f| (Born and Wolf, Principles of Optics, 7th ed., Sec. 8.5.2,
+    https://doi.org/10.1017/CBO9781139644181). From
     (2 J1(w) / w)' = -2 J2(w) / w, the transform of s_l P is -i (D / 2) (f_l / |f|) 2 J2(w) / w.
     """
 
@@ -111,9 +112,9 @@ class Disc(SourceModelBase):
 class Rectangle(SourceModelBase):
     """Uniform rectangle, such as the front glass of a halogen lamp.
 
-    P~(f) = sinc(pi f_x a) sinc(pi f_y b) with sinc(w) = sin(w) / w (Goodman, Introduction to Fourier Optics,
-    rectangular aperture). From sinc'(w) = -j1(w), the spherical Bessel function, the transform of x P is
-    -i (a / 2) j1(pi f_x a) sinc(pi f_y b).
+    P~(f) = sinc(pi f_x a) sinc(pi f_y b) with sinc(w) = sin(w) / w (Born and Wolf, Principles of Optics, 7th ed.,
+    Sec. 8.5.1, https://doi.org/10.1017/CBO9781139644181). From sinc'(w) = -j1(w), the spherical Bessel function, the
+    transform of x P is -i (a / 2) j1(pi f_x a) sinc(pi f_y b).
     """
 
     name: ClassVar[str] = "rectangle"

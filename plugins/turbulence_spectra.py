@@ -34,7 +34,8 @@ def _energy_range(f: NDArray[np.float64], outer_scale: float | None) -> NDArray[
 class Kolmogorov(TurbulenceSpectrumBase):
     """Inertial range without inner or outer scale.
 
-    S_n(f) = 0.033 (2 pi)^(-2/3) f^(-11/3): Sauvage et al. 2021, Eq. (14); Kolmogorov 1941.
+    S_n(f) = 0.033 (2 pi)^(-2/3) f^(-11/3): Sauvage et al. 2021, Eq. (14), https://doi.org/10.1364/AO.438170; Andrews
+    and Phillips, Laser Beam Propagation through Random Media, 2nd ed., Eq. (3.18), https://doi.org/10.1117/3.626196.
     """
 
     name: ClassVar[str] = "kolmogorov"
