@@ -1,13 +1,16 @@
-"""Slopes and fluxes from Shack-Hartmann frames: one centre of gravity per source, subaperture and frame.
+"""Slopes and fluxes from Shack-Hartmann frames: one position per source, subaperture and frame.
 
-Two ways to place the window (`ExtractionParameters.method`):
+The ways to measure a position (`ExtractionParameters.method`):
 
 ``subpixel_window``
     The brightest pixel within `search` of the spot's mean position is the start. A rectangle whose border
     pixels count by the fraction of them that it covers is then re-centred `passes` times on its own centre of
-    gravity. Nothing jumps when a spot crosses from one pixel to the next.
+    gravity. Nothing jumps when a spot crosses from one pixel to the next. What the mean spot of the other source has
+    in the rectangle is taken off.
 ``moving_maximum``
     A rectangle of whole pixels (odd sides) centred on the brightest pixel (Sauvage et al. 2021).
+``thresholded``, ``weighted``, ``template``
+    See :mod:`coslidar.pipeline.refinement`; they begin where the sub-pixel window ends.
 
 Pixels are calibrated as (frame - dark) / flat. A bad pixel is never read: its value is predicted from its good
 neighbours, with the weights that predict it best for the archive's own mean spot at any sub-pixel position.
@@ -15,7 +18,7 @@ Where there is no dark, a plane fitted to the mean frame outside the spot window
 
 Slopes are displacements from the spot's position in the mean frame, times the pixel scale. Their zero is as
 arbitrary as the choice of frames that were averaged; only fluctuations are used later. Fluxes are plain sums
-over the window, in counts: neither thresholded nor clipped.
+over the window, in counts, neither thresholded nor clipped; those of a fit are the fit's.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ import numpy as np
 from scipy import ndimage
 
 from .bad_pixels import no_bad_pixels
+from .refinement import refine
 from .spots import FLAGS, Calibration, SpotLayout
 from .window_kernel import window_kernel
 
@@ -40,10 +44,13 @@ if TYPE_CHECKING:
 __all__ = ["FLAGS", "Calibration", "SpotLayout", "extract", "response_to_tilt"]
 
 #: Changes whenever the numbers that this stage returns for the same input change.
-VERSION = 1
+VERSION = 2
 
 #: Part of its mean flux below which a spot is taken to be absent from a frame.
 FLUX_FLOOR = 0.02
+
+#: Methods for which the window is but the beginning.
+REFINED = ("thresholded", "weighted", "template")
 
 _NUMPY_TYPES = (np.uint8, np.uint16, np.int16, np.float32)
 
@@ -98,6 +105,7 @@ def extract(
     behind = np.repeat(column, np.diff(layout.bad_start))
     bad_index = layout.bad_index // columns * length + layout.bad_index % columns + behind
     bad_neighbour = layout.bad_neighbour // columns * length + layout.bad_neighbour % columns + behind[:, None]
+    whole = parameters.method == "moving_maximum"
     window_kernel(_eights(int(2 * parameters.search)), tall, _eights(wide + 2))(
         frames.reshape(-1),
         len(frames),
@@ -119,7 +127,10 @@ def extract(
         layout.spots,
         layout.search,
         np.array(layout.window, dtype=np.float32),
-        1 if parameters.method == "moving_maximum" else parameters.passes,
+        1 if whole else parameters.passes,
+        np.ones_like(layout.boost) if whole else layout.boost,
+        layout.wings,
+        layout.wing_start,
         np.maximum(FLUX_FLOOR * layout.flux, 0.0),
         _half_way(layout.spots),
         layout.excluded,
@@ -130,6 +141,11 @@ def extract(
         flux,
         flag,
     )
+    if parameters.method in REFINED:
+        zero = np.moveaxis(layout.spots, -1, 0)[::-1]
+        position = slopes / layout.pixel_scale + zero
+        refine(frames, layout, parameters, position, flux, flag)
+        slopes = (position - zero) * layout.pixel_scale
     return slopes, flux, flag
 
 

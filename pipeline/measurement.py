@@ -166,16 +166,23 @@ def _judged(
         mean = np.nanmean(flux, axis=0)
     height, width = found.window
     electrons = header.instrument.gain
+    slope_noise = noise.slope_noise_variance(
+        found, flux[:: noise.EVERY], dark, electrons, recentred=parameters.method != "moving_maximum"
+    )
+    gain = response_to_tilt(found, parameters)
+    if parameters.gain == "corrected":
+        # A source that was never lit has no gain, and no slopes.
+        known = np.where(gain > 0, gain, np.nan)[..., None]
+        slopes /= known
+        slope_noise = slope_noise / known**2
     return Measurements(
         time,
         slopes,
         flux,
         flag,
         flux_noise=noise.flux_noise_variance(mean, dark, height * width, electrons),
-        slope_noise=noise.slope_noise_variance(
-            found, flux[:: noise.EVERY], dark, electrons, recentred=parameters.method != "moving_maximum"
-        ),
-        centroid_gain=response_to_tilt(found, parameters),
+        slope_noise=slope_noise,
+        centroid_gain=gain,
     )
 
 

@@ -82,6 +82,12 @@ class ExtractionParameters(Parameters):
     """Width of the window along x; as large as box and sources allow where it is absent."""
     window_y: Pixels | None = Field(default=None, gt=0)
     """Height of the window along y; as large as the other source allows where it is absent."""
+    wings: Literal["removed", "kept"] = "removed"
+    """Of `subpixel_window` with two sources: whether what the mean spot of the other source has in the window is taken
+    off flux and centroid."""
+    gain: Literal["reported", "corrected"] = "reported"
+    """Response of the slopes to a known tilt of the mean spot, along each axis for each source: recorded only, or
+    recorded and divided out."""
     passes: int = Field(default=3, ge=1, le=20)
     """How often window, threshold, weight or fit are re-centred on the position that they gave."""
     threshold: float = Field(default=0.1, ge=0, lt=1)

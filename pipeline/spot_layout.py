@@ -10,7 +10,9 @@ import numpy as np
 from scipy import ndimage
 
 from .bad_pixels import fill, light_on, no_bad_pixels, predictors
-from .extraction import measure_boxes, search_region
+from .extraction import REFINED, measure_boxes, search_region
+from .mean_spot import mean_spots, window_response, wings
+from .refinement import prepared
 from .spots import FLAGS, Calibration, SpotLayout
 
 if TYPE_CHECKING:
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
+#: Least response of a window that stays where it is: faint or broad spots must not make it jump.
+LEAST_RESPONSE = 0.7
 #: A source of which this part of the spots is found is lit.
 LIT = 0.5
 #: Brightness of a spot's core, relative to the brighter source's in the same box, up to which it may be a wing of that.
@@ -142,9 +146,13 @@ def layout(
         bad_neighbour=neighbour,
         bad_weight=weight,
         excluded=np.zeros(spots.shape[:2], dtype=np.uint8),
+        boost=np.ones((len(nominal), 2), dtype=np.float32),
     )
     # Second: positions on the filled mean boxes, then templates of spots brought to one place.
-    spots, _ = measure_boxes(first, filled, parameters)
+    plain = parameters
+    if parameters.method in REFINED:
+        plain = parameters.model_copy(update={"method": "subpixel_window"})
+    spots, _ = measure_boxes(first, filled, plain)
     spots = np.where(np.isfinite(spots), spots, first.spots)
     template, centre = _templates(filled, bad, spots)
     if previous is not None:
@@ -157,7 +165,7 @@ def layout(
         flat_box[index[begin:end]] = np.einsum(
             "bn,bn->b", weight[begin:end], flat_box[neighbour[begin:end]].astype(np.float64)
         )
-    spots, flux = measure_boxes(replace(first, spots=spots), filled, parameters)
+    spots, flux = measure_boxes(replace(first, spots=spots), filled, plain)
     missing: NDArray[np.bool_] = np.logical_not(np.isfinite(spots).all(axis=-1))
     spots = np.where(missing[..., None], first.spots, spots)
     excluded = np.where(missing | ~_has_spot(filled, spots, window), FLAGS["no_spot"], 0) | np.where(
@@ -169,7 +177,7 @@ def layout(
         spots = np.where(gone[..., None], first.spots, spots)
         flux = np.where(gone, previous.flux, flux)
         excluded = np.where(gone, excluded & ~FLAGS["no_spot"], excluded)
-    return replace(
+    found = replace(
         first,
         spots=spots,
         flux=flux,
@@ -182,6 +190,13 @@ def layout(
         bad_weight=weight,
         excluded=excluded.astype(np.uint8),
     )
+    alone = mean_spots(found)
+    response = np.clip(window_response(alone, found), LEAST_RESPONSE, 1.0)
+    found = replace(found, boost=(1 / response).astype(np.float32))
+    if parameters.wings == "removed" and parameters.method == "subpixel_window" and len(nominal) == 2:
+        table, begin = wings(alone, found, 2 * parameters.search)
+        found = replace(found, wings=table, wing_start=begin)
+    return replace(found, prepared=prepared(found, parameters))
 
 
 def _cut(image: NDArray[Any], boxes: NDArray[np.int64], pitch: tuple[int, int]) -> NDArray[Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,9 @@ FLAGS: dict[str, int] = {
     "no_spot": 32,  # the mean frame shows no spot here, in every frame
     "saturated": 64,  # a pixel in the window has reached the saturation level; the measurement is kept
 }
+
+#: Step of the tables of wings, px.
+WING_STEP = 0.5
 
 
 @dataclass(frozen=True)
@@ -91,6 +94,16 @@ class SpotLayout:
         Pixels that predict it, and their weights.
     excluded : ndarray of uint8, (S, A)
         Bits of `FLAGS` that hold for every frame.
+    boost : ndarray of float32, (S, 2)
+        Motion of the mean spot along y and x, per motion of its centre of gravity in a window that stays where it is.
+    wings : ndarray of float32, (S, n, n, 3)
+        What a spot of the other source with light 1 has in a window around this source's: light, and first moments
+        along y and x around the window's centre. The other lies (row, col) away from there, by `wing_start` and steps
+        of `WING_STEP`. Empty where nothing is to be taken off.
+    wing_start : ndarray of float32, (S, 2)
+        See `wings`.
+    prepared : tuple of ndarray
+        What the method needs besides; see :func:`coslidar.pipeline.refinement.prepared`.
     """
 
     boxes: NDArray[np.int64]
@@ -113,3 +126,7 @@ class SpotLayout:
     bad_neighbour: NDArray[np.int64]
     bad_weight: NDArray[np.float32]
     excluded: NDArray[np.uint8]
+    boost: NDArray[np.float32]
+    wings: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 2, 3), dtype=np.float32))
+    wing_start: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
+    prepared: tuple[NDArray[Any], ...] = ()

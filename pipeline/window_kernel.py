@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numba import njit
 
-from .spots import FLAGS
+from .spots import FLAGS, WING_STEP
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -40,6 +40,8 @@ def window_kernel(lanes: int, tall: int, wide: int) -> Callable[..., None]:
     relaxed = {"reassoc", "contract", "nsz", "arcp"}
     single, long, index = np.float32, np.int64, np.uint64
     half, one, none = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+    edge = np.float32(1e-3)
+    per_step = np.float32(1.0 / WING_STEP)
     no_light, window_left, strayed = FLAGS["no_light"], FLAGS["window_left"], FLAGS["strayed"]
     not_converged, saturated = FLAGS["not_converged"], FLAGS["saturated"]
 
@@ -66,6 +68,9 @@ def window_kernel(lanes: int, tall: int, wide: int) -> Callable[..., None]:
         search: Any,
         window: Any,
         passes: Any,
+        boost: Any,
+        wings: Any,
+        wing_start: Any,
         floor: Any,
         divide: Any,
         excluded: Any,
@@ -88,6 +93,7 @@ def window_kernel(lanes: int, tall: int, wide: int) -> Callable[..., None]:
         last_x = np.zeros(n_sources, dtype=np.float32)
         light_of = np.zeros(n_sources, dtype=np.float32)
         brightest = np.zeros(n_sources, dtype=np.float32)
+        leak = np.zeros(3, dtype=np.float32)
         states = np.zeros(n_sources, dtype=np.uint8)
         for frame in range(n_frames):
             for n in range(first_pixel.size):
@@ -189,22 +195,47 @@ def window_kernel(lanes: int, tall: int, wide: int) -> Callable[..., None]:
                             last_y[s] = y
                             last_x[s] = x
                             light_of[s] = light
-                            at_y[s] = moment_y / light + single(row)
-                            at_x[s] = moment_x / light + single(column)
+                            at_y[s] = y + (moment_y / light + single(row) - y) * boost[s, 0]
+                            at_x[s] = x + (moment_x / light + single(column) - x) * boost[s, 1]
+                    for s in range(n_sources):
+                        if states[s] & window_left == 0:
+                            move_y = at_y[s] - spots[s, a, 0]
+                            move_x = at_x[s] - spots[s, a, 1]
+                            if not light_of[s] > floor[s, a]:
+                                states[s] |= no_light
+                            elif not move_y * divide[s, a, 0] + move_x * divide[s, a, 1] < one:
+                                states[s] |= strayed
+                            elif passes > 1 and max(abs(at_y[s] - last_y[s]), abs(at_x[s] - last_x[s])) > CONVERGENCE:
+                                states[s] |= not_converged
+                    both = wings.shape[0] == 2 and states[0] == 0 and states[n_sources - 1] == 0
                     for s in range(n_sources):
                         state = states[s]
                         light = light_of[s]
                         y = at_y[s]
                         x = at_x[s]
+                        if both:
+                            # What the other source's mean spot has in this window, where it is seen from here.
+                            other = n_sources - 1 - s
+                            away_y = (at_y[other] - last_y[s] - wing_start[s, 0]) * per_step
+                            away_x = (at_x[other] - last_x[s] - wing_start[s, 1]) * per_step
+                            away_y = max(min(away_y, single(wings.shape[1]) - one - edge), none)
+                            away_x = max(min(away_x, single(wings.shape[2]) - one - edge), none)
+                            i_y = long(away_y)
+                            i_x = long(away_x)
+                            part_y = away_y - single(i_y)
+                            part_x = away_x - single(i_x)
+                            for m in range(3):
+                                upper = wings[s, i_y, i_x, m] * (one - part_x) + wings[s, i_y, i_x + 1, m] * part_x
+                                lower = (
+                                    wings[s, i_y + 1, i_x, m] * (one - part_x) + wings[s, i_y + 1, i_x + 1, m] * part_x
+                                )
+                                leak[m] = (upper * (one - part_y) + lower * part_y) * light_of[other]
+                            own = light - leak[0]
+                            y = ((y - last_y[s]) * light - leak[1] * boost[s, 0]) / own + last_y[s]
+                            x = ((x - last_x[s]) * light - leak[2] * boost[s, 1]) / own + last_x[s]
+                            light = own
                         move_y = y - spots[s, a, 0]
                         move_x = x - spots[s, a, 1]
-                        if state & window_left == 0:
-                            if not light > floor[s, a]:
-                                state |= no_light
-                            elif not move_y * divide[s, a, 0] + move_x * divide[s, a, 1] < one:
-                                state |= strayed
-                            elif passes > 1 and max(abs(y - last_y[s]), abs(x - last_x[s])) > CONVERGENCE:
-                                state |= not_converged
                         good = state == 0
                         slopes[frame, 0, s, a] = move_x * pixel_scale if good else np.nan
                         slopes[frame, 1, s, a] = move_y * pixel_scale if good else np.nan

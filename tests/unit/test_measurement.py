@@ -157,3 +157,16 @@ def test_frames_and_time_stamps_must_agree() -> None:
             measure([images], np.arange(stamps), HEADER, DARK, PARAMETERS)
     with pytest.raises(MeasurementError, match="no frame"):
         measure([], np.arange(0), HEADER, DARK, PARAMETERS)
+
+
+def test_gain_is_reported_or_divided_out() -> None:
+    """A window of three pixels around the brightest cuts off what moves out of it."""
+    images, _ = record(256, np.zeros((256, 2)), np.ones((256, 2)))
+    poor = {"reference_frames": 64, "method": "moving_maximum", "window_x": "3 pixel", "window_y": "3 pixel"}
+    reported = measured(images, parameters=ExtractionParameters(**poor))
+    corrected = measured(images, parameters=ExtractionParameters(**poor, gain="corrected"))
+    gain = reported.centroid_gain
+    np.testing.assert_array_equal(corrected.centroid_gain, gain)
+    assert np.abs(gain - 1).max() > 0.02
+    np.testing.assert_allclose(corrected.slopes, reported.slopes / gain[..., None], rtol=1e-12)
+    np.testing.assert_allclose(corrected.slope_noise, reported.slope_noise / gain[..., None] ** 2, rtol=1e-12)

@@ -87,7 +87,9 @@ def test_slope_noise_against_drawn_frames(window: tuple[str, str], light: float)
     parameters = ExtractionParameters(window_x=window[0], window_y=window[1])
     found, slopes, flux = drawn(parameters, light, 1500, 3)
     predicted = slope_noise_variance(found, flux, READ**2, GAIN)
-    ratio = slopes.var(axis=0).mean(axis=-1) / predicted.mean(axis=-1)
+    # The faintest spots now and then move the window to the end.
+    assert np.isnan(slopes).mean() < 1e-3
+    ratio = np.nanvar(slopes, axis=0).mean(axis=-1) / predicted.mean(axis=-1)
     np.testing.assert_allclose(ratio, 1.0, atol=0.08)
 
 
