@@ -38,8 +38,10 @@ def _shared(draws: int) -> Callable[[Callable[..., None]], Callable[..., None]]:
     def add(function: Callable[..., None]) -> Callable[..., None]:
         for option in reversed(
             (
-                click.option("--draws", type=click.IntRange(2, 10000), default=draws, show_default=True),
-                click.option("--seed", type=click.IntRange(0), default=0, show_default=True),
+                click.option("--draws", type=click.IntRange(2, 10000), default=draws, show_default=True,
+                             help="How many times noise is drawn for each profile."),
+                click.option("--seed", type=click.IntRange(0), default=0, show_default=True,
+                             help="Of the random numbers: the same seed, the same draws."),
                 click.option(
                     "--frames", type=click.Choice(["measured", "independent"]), default="measured", show_default=True,
                     help="Effectively independent frames: 1460, 910 and 4930 for x, y slopes and fluxes, as measured "
