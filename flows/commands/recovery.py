@@ -16,7 +16,9 @@ if TYPE_CHECKING:
 @click.argument("scenario")
 @click.option("--records", type=click.IntRange(2, 10000), default=50, show_default=True, help="How many recordings.")
 @click.option("--duration", default="20 s", show_default=True, help="Length of each.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random numbers: the same seed, the same draws."
+)
 @click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE",
               help="One setting of the chain, as for a run; may be repeated: --set selector=evidence.")  # fmt: skip
 @click.option("--no-frames", is_flag=True, help="Take the simulator's own slopes and fluxes instead of frames.")
