@@ -26,7 +26,9 @@ def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[st
 
 @click.command()
 @click.argument("inputs", metavar="CAMPAIGN.toml | PRODUCT | FOLDER", nargs=-1, required=True)
-@click.option("--format", "form", type=click.Choice(list(_ENDINGS)), default="csv", show_default=True)
+@click.option(
+    "--format", "form", type=click.Choice(list(_ENDINGS)), default="csv", show_default=True, help="What to write."
+)
 @click.option(
     "-o",
     "--output",
