@@ -23,7 +23,8 @@ def _fields() -> str:
 @click.argument("query", nargs=-1)
 @OUT
 @click.option(
-    "--format", "form", type=click.Choice(["table", "csv", "json", "parquet"]), default="table", show_default=True
+    "--format", "form", type=click.Choice(["table", "csv", "json", "parquet"]), default="table", show_default=True,
+    help="A table to read, or what other programs read.",
 )
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write (.parquet needs it)."
