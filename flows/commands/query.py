@@ -23,7 +23,11 @@ def _fields() -> str:
 @click.argument("query", nargs=-1)
 @OUT
 @click.option(
-    "--format", "form", type=click.Choice(["table", "csv", "json", "parquet"]), default="table", show_default=True,
+    "--format",
+    "form",
+    type=click.Choice(["table", "csv", "json", "parquet"]),
+    default="table",
+    show_default=True,
     help="A table to read, or what other programs read.",
 )
 @click.option(

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
 @click.option("--records", type=click.IntRange(2, 10000), default=50, show_default=True, help="How many recordings.")
 @click.option("--duration", default="20 s", show_default=True, help="Length of each.")
 @click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Of the random numbers: the same seed, the same draws."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Of the random numbers: the same seed, the same draws.",
 )
 @click.option("--set", "assignments", multiple=True, metavar="KEY=VALUE",
               help="One setting of the chain, as for a run; may be repeated: --set selector=evidence.")  # fmt: skip
