@@ -32,11 +32,10 @@ from ...catalog.report.reading import LEVELS, bounds, flag_names, flags, levels
 from ...catalog.report.two_lineages import differences, slice_rows, summary_rows, two_profiles_markup
 from ...catalog.report.words import clean, clock, interval, mapping, number
 from ...catalog.store import CatalogError
-from .panels import FORMATS, PANELS, Drawn, figure_bytes, panel_markup
+from .panels import FORMATS, PANELS, Dataset, Drawn, figure_bytes, panel_markup
 
 if TYPE_CHECKING:
     from starlette.requests import Request
-    from xarray import Dataset
 
     from ...catalog.store import BatchRow, Catalog, ProductRow
 

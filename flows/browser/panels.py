@@ -6,7 +6,7 @@ import io
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -14,9 +14,8 @@ from ...catalog.report import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, 
 from ...catalog.report.reading import values
 from ...catalog.report.svg import inline_svg
 
-if TYPE_CHECKING:
-    from xarray import Dataset
-
+#: An xarray Dataset; only the catalog imports xarray.
+Dataset: TypeAlias = Any
 #: Formats of a figure that can be downloaded -> media type.
 FORMATS = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
 PANELS: dict[str, BatchPanel | TimePanel] = {panel.key: panel for panel in (*TIME_PANELS, *BATCH_PANELS)}

@@ -23,6 +23,7 @@ def frames(path: Path, number: int) -> None:
     fits.PrimaryHDU(random.poisson(mean, (40, 160, 160)).astype(np.uint16)).writeto(path)
 
 
+@pytest.mark.slow
 def test_the_page_from_frames_to_an_archive(tmp_path: Path) -> None:
     frames(tmp_path / "frames.fits", 1)
     fits = pytest.importorskip("astropy.io.fits")
