@@ -354,6 +354,11 @@ def says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
     return not panel.variables or any(value is not None and bool(np.isfinite(value).any()) for value in found)
 
 
+def _known(panel: TimePanel, products: Sequence[Dataset]) -> bool:
+    """Whether a product holds what the panel is about, be it without a value."""
+    return not panel.variables or any(name in dataset for dataset in products for name in panel.variables)
+
+
 def _markup(panel: BatchPanel | TimePanel, prefix: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
     text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
     svg = ""
@@ -467,15 +472,13 @@ def geometry(products: Sequence[Dataset]) -> list[dict[str, str]]:
             scale = 100 * np.asarray(dataset["fresnel_scale"].values, dtype=np.float64)
             rows.append(("Fresnel scale on the pupil", f"{number(float(scale[0]), 3)} to {number(float(scale[-1]), 3)}",
                          "cm", "size of the scintillation from the first and from the last slice"))  # fmt: skip
-        if "resolution_length" in dataset:
-            length = np.asarray(dataset["resolution_length"].values, dtype=np.float64)
-            if np.isfinite(length).any():
-                with np.errstate(all="ignore"):
-                    median = np.nanmedian(length[np.isfinite(length).any(axis=1)], axis=0)
-                rows.append(("Resolution of the profiles", f"{number(float(np.nanmin(median)), 3)} to "
-                             f"{number(float(np.nanmax(median)), 3)}", "m",
-                             "length of path that a slice stands for, median"))  # fmt: skip
         found |= dict.fromkeys(row for row in rows if row[1])
+    lengths = [values(dataset, "resolution_length") for dataset in products]
+    known = np.concatenate([np.ravel(length) for length in lengths if length is not None] or [np.empty(0)])
+    if (known := known[np.isfinite(known)]).size:
+        found[("Resolution of the profiles", number(float(np.median(known)), 3), "m",
+               f"length of path that a slice stands for: median; {number(float(known.min()), 3)} to "
+               f"{number(float(known.max()), 3)}")] = None  # fmt: skip
     return [dict(zip(("name", "value", "unit", "remark"), row, strict=True)) for row in found]
 
 
@@ -679,7 +682,7 @@ def render(
     panels = [
         _markup(panel, f"t{panel.key}", products)
         for panel in TIME_PANELS
-        if panel.key != "map" or (several and says_something(panel, products))
+        if _known(panel, products) and (panel.key != "map" or (several and says_something(panel, products)))
     ]
     documents = _documents(products)
     environment = Environment(

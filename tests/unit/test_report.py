@@ -469,7 +469,7 @@ def test_geometry_is_told_with_units(source: str) -> None:
         "Resolution near the pupil214.8 m",
         "Pupil along y35.0 cm",
         "Fresnel scale on the pupil2.10 to 48.3 cm",
-        "Resolution of the profiles500 to 500 m",
+        "Resolution of the profiles500 m (length of path that a slice stands for: median; 500 to 500",
     ):
         assert expected in text, expected
 
@@ -642,6 +642,31 @@ def test_a_browser_runs_the_page_without_a_complaint(source: str, tmp_path: Path
     articles = re.findall(r"<article[^>]*>", done.stdout)
     assert ["hidden" in article for article in articles] == [False, True]
     assert '<p class="picker" id="picker">' in done.stdout
+
+
+@pytest.mark.slow
+def test_the_page_needs_no_sideways_scrolling_at_400_percent(tmp_path: Path) -> None:
+    """A window of 1280 pixels shows 320 at 400 % (WCAG 2.2, 1.4.10); tables and figures scroll in boxes of their own."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium: the page is not opened in a browser")
+    long = "x" * 200
+    source = report.render(product(2, attributes={"campaign": long, "archive": long, "note": long}), most_batches=1)
+    # The page's own policy would not let anybody measure it.
+    source = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", source)
+    probe = "const d = document.documentElement; parent.document.title = d.clientWidth + ' ' + d.scrollWidth;"
+    (tmp_path / "page.html").write_text(source.replace("</body>", f"<script>{probe}</script></body>"), "utf-8")
+    frame = '<iframe src="page.html" style="width: 320px; height: 800px"></iframe>'
+    (tmp_path / "frame.html").write_text(f"<!DOCTYPE html><title>none</title>{frame}", "utf-8")
+    done = subprocess.run(
+        [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-web-security", "--dump-dom",
+         "--allow-file-access-from-files", "--virtual-time-budget=5000", f"--user-data-dir={tmp_path / 'profile'}",
+         (tmp_path / "frame.html").as_uri()],
+        check=True, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    shown, needed = (int(n) for n in re.findall(r"<title>(\d+) (\d+)</title>", done.stdout)[0])
+    assert 0 < shown <= 320
+    assert needed <= shown
 
 
 # --- words -------------------------------------------------------------------------------------------------
