@@ -421,7 +421,7 @@ def quiet(**changes: Any) -> dict[str, Any]:
 def test_every_shipped_scenario_can_be_read_and_drawn() -> None:
     assert set(shipped()) == {
         "bad-weather", "declining-afternoon", "demo", "lannemezan-strong", "lannemezan-weak", "one-source",
-        "plane-wave", "single-layer", "uniform",
+        "plane-wave", "single-layer", "six-by-six-strong", "six-by-six-weak", "uniform",
     }  # fmt: skip
     for name, description in shipped().items():
         assert len(description) > 10
