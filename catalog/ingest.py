@@ -323,12 +323,12 @@ def instant(value: str, zone: str | None = None) -> int:
     if match is None:
         raise FileFault(f"{value!r} is no time; write 2012-09-14T12:15:00Z")
     day, clock, fraction, offset = match.groups()
-    if offset is None and zone is None:
-        raise FileFault(f"{value!r} names no time zone; append Z if it is UTC, or set ingest.time.zone")
     try:
         moment = datetime.fromisoformat(f"{day}T{clock or '00:00'}")
     except ValueError as error:
         raise FileFault(f"{value!r} is no time ({error})") from error
+    if offset is None and zone is None:
+        raise FileFault(f"{value!r} names no time zone; append Z if it is UTC, or set ingest.time.zone")
     if offset is None:
         moment = moment.replace(tzinfo=ZoneInfo(str(zone)))
     elif offset in ("Z", "UTC"):
