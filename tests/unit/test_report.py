@@ -646,7 +646,7 @@ def test_a_browser_runs_the_page_without_a_complaint(source: str, tmp_path: Path
 
 @pytest.mark.slow
 def test_the_page_needs_no_sideways_scrolling_at_400_percent(tmp_path: Path) -> None:
-    """A window of 1280 pixels shows 320 at 400 % (WCAG 2.2, 1.4.10); tables and figures scroll in boxes of their own."""
+    """1280 pixels are 320 at 400 % (WCAG 2.2, 1.4.10); tables and figures scroll in boxes of their own."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")
     if browser is None:
         pytest.skip("no chromium: the page is not opened in a browser")
