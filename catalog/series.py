@@ -184,11 +184,11 @@ def _typed(table: _Table, origin: str, reading: Reading) -> TimeSeries:
             chosen.setdefault(quantity, []).append(name)
     for quantity, names in chosen.items():
         if len(names) > 1:
-            faults.append(
-                f"{origin}: {' and '.join(repr(name) for name in names)} could both be {quantity}; choose one with "
-                f"columns = {{ {quantity} = '{names[0]}' }}"
+            warnings.append(
+                f"{origin}: {' and '.join(repr(name) for name in names)} could both be {quantity}; neither is read; "
+                f"choose one with columns = {{ {quantity} = '{names[0]}' }}"
             )
-    wanted = {quantity: names[0] for quantity, names in chosen.items()}
+    wanted = {quantity: names[0] for quantity, names in chosen.items() if len(names) == 1}
     for quantity, name in reading.columns.items():
         if quantity not in QUANTITIES:
             faults.append(f"{origin}: columns.{quantity}: there is no such quantity; known: {', '.join(QUANTITIES)}")

@@ -135,7 +135,7 @@ def test_missing_and_impossible_values(tmp_path: Path) -> None:
         ("a,b\n1,2\n", {}, "no column is called 'time'"),
         ("time;Cn2 [m^(-2/3)]\n2012-09-14T12:00Z;1,5\n2012-09-14T12:01Z;1,5\n", {}, "use a point as decimal sign"),
         ("time,foo\n2012-09-14T12:00Z,1\n2012-09-14T12:01Z,1\n", {}, "no column is known; it has foo"),
-        ("time,T_1m [K],T_2m [K]\n2012-09-14T12:00Z,1,1\n2012-09-14T12:01Z,1,1\n", {}, "could both be temperature"),
+        ("time,T_1m [K],T_2m [K]\n2012-09-14T12:00Z,1,1\n2012-09-14T12:01Z,1,1\n", {}, "no column is known"),
         ("time,x [m^(-2/3)]\n2012-09-14T12:00Z,1\n2012-09-14T12:01Z,1\n", {"columns": {"cn2": "y"}}, "no such column"),
         ("time,x [m]\n2012-09-14T12:00Z,1\n2012-09-14T12:01Z,1\n", {"columns": {"c2": "x"}}, "no such quantity"),
         ("time,Cn2 [m^(-2/3)]\n2012-09-14T12:00Z,1\n2012-09-14T12:00Z,1\n2012-09-14T12:01Z,1\n", {}, "there twice"),
@@ -145,6 +145,18 @@ def test_missing_and_impossible_values(tmp_path: Path) -> None:
 )
 def test_faults_of_csv(tmp_path: Path, text: str, reading: dict[str, object], fault: str) -> None:
     assert fault in faults(written(tmp_path, text), **reading)[0]
+
+
+def test_two_columns_that_could_be_one_quantity(tmp_path: Path) -> None:
+    path = written(
+        tmp_path, "time,Cn2 [m^(-2/3)],T_1m [K],T_2m [K]\n2012-09-14T12:00Z,1,280,281\n2012-09-14T12:01Z,1,1,1\n"
+    )
+    found = read_series(path)
+    assert set(found.values) == {"cn2"}
+    assert "could both be temperature; neither is read" in found.warnings[0]
+    chosen = read_series(path, Reading(columns={"temperature": "T_2m"}))
+    assert chosen.values["temperature"][0] == 281
+    assert not chosen.warnings
 
 
 def test_every_fault_at_once(tmp_path: Path) -> None:
