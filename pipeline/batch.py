@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
-REDUCE_VERSION = 3
+REDUCE_VERSION = 4
 RESPONSE_VERSION = 2
 RETRIEVE_VERSION = 5
 
@@ -230,12 +230,13 @@ def reduce(
     tilt = timing.pupil_mean(slopes)
     common = timing.regular(timing.pupil_mean(tilt), measurements.time, frame_rate)
     line = vibration.find_line(common, frame_rate)
+    shaken = line.variance + line.harmonics.sum(axis=0)
     maps = found.maps
     if parameters.vibration == "subtracted":
         maps = maps.copy()
         for number, kind in enumerate(MAP_KINDS):
             if kind in SLOPE_KINDS:
-                maps[number] -= line.variance["xy".index(kind[0])]
+                maps[number] -= shaken["xy".index(kind[0])]
 
     stamps = timing.stamps(measurements.time, frame_rate)
     index = found.scintillation_index - detection
@@ -287,6 +288,7 @@ def reduce(
             "centroid_gain": measurements.centroid_gain.T,
             "vibration_frequency": np.asarray(line.frequency),
             "vibration_variance": line.variance,
+            "vibration_harmonic_variance": line.harmonics,
             "vibration_significance": np.asarray(line.significance),
             "slope_spectrum": vibration.spectrum(common, frame_rate),
             "zernike_variance": modes.variance,

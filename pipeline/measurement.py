@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import noise
-from .extraction import extract, response_to_tilt
+from .extraction import REFINED, extract, response_to_tilt
 from .products import Measurements
 from .spot_layout import LIT, layout, reference_image
 from .spots import FLAGS
@@ -166,9 +166,12 @@ def _judged(
         mean = np.nanmean(flux, axis=0)
     height, width = found.window
     electrons = header.instrument.gain
-    slope_noise = noise.slope_noise_variance(
-        found, flux[:: noise.EVERY], dark, electrons, recentred=parameters.method != "moving_maximum"
-    )
+    few = flux[:: noise.EVERY]
+    if parameters.method in REFINED:
+        slope_noise = noise.refined_noise_variance(found, few, dark, electrons, parameters)
+    else:
+        recentred = parameters.method != "moving_maximum"
+        slope_noise = noise.slope_noise_variance(found, few, dark, electrons, recentred=recentred)
     gain = response_to_tilt(found, parameters)
     if parameters.gain == "corrected":
         # A source that was never lit has no gain, and no slopes.

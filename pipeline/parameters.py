@@ -118,7 +118,8 @@ class CorrelationParameters(Parameters):
     (Sauvage et al. 2021)."""
     vibration: Literal["absorbed", "subtracted"] = "absorbed"
     """`absorbed`: the vibration line stays in the slope maps, for the inversion's constant to take up; `subtracted`:
-    its variance is taken off every entry of the four slope maps (Sauvage et al. 2021, section 4.2). Recorded always."""
+    its variance and that of its harmonics are taken off every entry of the four slope maps (Sauvage et al. 2021,
+    section 4.2). Recorded always."""
     flux_trend: Frequency | None = Field(default=None, gt=0)
     """Changes of a source's light slower than this, common to all subapertures, are divided out; nothing is where it is
     absent."""

@@ -92,6 +92,8 @@ RADIAL_ORDERS = (1, 2, 3, 4, 5)
 #: Width and centres of the bins of the log-amplitude histogram.
 LOG_AMPLITUDE_STEP = 0.01
 LOG_AMPLITUDES: NDArray[np.float64] = (np.arange(200) - 99.5) / 100
+#: Multiples of the frequency of the vibration line at which its harmonics are looked for, at their aliases.
+HARMONICS = (2, 3, 4, 5)
 #: Parts of the chosen mu at which a profile is retrieved as well, to show what depends on it (Sauvage et al. 2021,
 #: Sec. 4.3).
 MU_FACTORS = (0.01, 100.0)
@@ -107,6 +109,7 @@ COORDINATES = _schema(
     ("radial_order", "radial_order", "1", "int64", "radial order of Zernike modes"),
     ("log_amplitude", "log_amplitude", "1", "float64", "log-amplitude chi = ln(i / mean i) / 2, middle of a bin"),
     ("mu_factor", "mu_factor", "1", "float64", "mu of another profile, relative to the chosen one"),
+    ("harmonic", "harmonic", "1", "int64", "multiple of the frequency of the vibration line"),
     ("frequency", "frequency", "Hz", "float64", "temporal frequency, middle of a cell of the spectrum"),
 )
 
@@ -115,6 +118,7 @@ FIXED_COORDINATES: dict[str, NDArray[np.generic]] = {
     "radial_order": np.array(RADIAL_ORDERS, dtype=np.int64),
     "log_amplitude": LOG_AMPLITUDES,
     "mu_factor": np.array(MU_FACTORS),
+    "harmonic": np.array(HARMONICS, dtype=np.int64),
 }
 
 #: Every other variable of a product, schema version 1.
@@ -222,6 +226,7 @@ SCHEMA = _schema(
     ("centroid_gain", "time source axis", "1", "float64", "response of the slopes to a known tilt of the mean spot"),
     ("vibration_frequency", "time", "Hz", "float64", "vibration line, at its alias if above half the frame rate"),
     ("vibration_variance", "time axis", "rad^2", "float64", "variance of the slopes by the vibration line"),
+    ("vibration_harmonic_variance", "time harmonic axis", "rad^2", "float64", "the same by harmonics of that line"),
     ("slope_spectrum", "time axis frequency", "rad^2/Hz", "float64", "spectral density of the pupil-mean slopes"),
     ("vibration_significance", "time", "1", "float64", "strongest line over the continuum, in its deviations"),
     ("zernike_variance", "time source radial_order", "rad^2", "float64", "variance per mode of phase, noise removed"),

@@ -100,9 +100,10 @@ def refine(
         _thresholded(*result, np.array(layout.window) / 2, parameters.threshold, parameters.passes)
     elif parameters.method == "weighted":
         width = _weight_width(layout, parameters)
-        _weighted(*result, 4 * np.log(2) / width**2, WEIGHT_REACH * width, *layout.prepared, parameters.passes)
+        steepness, reach = 4 * np.log(2) / width**2, WEIGHT_REACH * width
+        _weighted(*result, steepness, reach, *layout.prepared, parameters.passes)  # type: ignore[call-arg]
     elif parameters.method == "template":
-        _fitted(*result, *layout.prepared, parameters.passes)
+        _fitted(*result, *layout.prepared, parameters.passes)  # type: ignore[call-arg]
 
 
 def prepared(layout: SpotLayout, parameters: ExtractionParameters) -> tuple[NDArray[Any], ...]:

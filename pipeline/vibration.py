@@ -18,6 +18,8 @@ import numpy as np
 from scipy import fft, ndimage
 from scipy.special import gammaincc
 
+from .products import HARMONICS
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -51,11 +53,15 @@ class Vibration(NamedTuple):
         Of the x and y slopes by vibration, rad^2; 0 where there is no line.
     significance : float
         Power of the strongest peak over the continuum, in standard deviations of the continuum.
+    harmonics : ndarray, (len(HARMONICS), 2)
+        Variance of the x and y slopes by the multiples `HARMONICS` of the frequency, rad^2; 0 where there is none,
+        or where its alias lies on another line or below `LOWEST`.
     """
 
     frequency: float
     variance: Floats
     significance: float
+    harmonics: Floats
 
 
 def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
@@ -80,9 +86,12 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
     slopes, with every frame of the same weight. The periodograms of both axes are averaged in cells of `CELL`, relative
     to the running median of their surroundings. In a smooth spectrum such an average follows a gamma distribution; the
     largest of all cells must exceed what it reaches with a chance of `FALSE_ALARM`. The variance is the sum over the
-    band of the line, less the mean level of as much spectrum on either side.
+    band of the line, less the mean level of as much spectrum on either side. Harmonics pass the
+    same test at the aliases of the multiples of the frequency. A line that stands out the most because the continuum is
+    low there may be one itself: of a stronger line at its half or third.
     """
-    nothing = Vibration(np.nan, np.zeros(2), np.nan)
+    none = np.zeros((len(HARMONICS), 2))
+    nothing = Vibration(np.nan, np.zeros(2), np.nan, none)
     missing = ~np.isfinite(tilt).all(axis=1)
     length = _length(len(tilt))
     per_cell = int(CELL * length / frame_rate)
@@ -105,30 +114,60 @@ def find_line(tilt: NDArray[np.floating], frame_rate: float) -> Vibration:
     degrees = 2 * per_cell / (1 + 1.57 / around)
     significance = float((excess[peak] - 1) * np.sqrt(degrees))
     if float(gammaincc(degrees, degrees * excess[peak])) * int(searched.sum()) > FALSE_ALARM:
-        return Vibration(np.nan, np.zeros(2), significance)
+        return Vibration(np.nan, np.zeros(2), significance, none)
 
-    # The line may lie on the border of two cells.
-    near = np.arange(max((peak - 1) * per_cell, 1), min((peak + 2) * per_cell, len(power)))
-    above = (power[near] / continuum[peak]).sum(axis=1)
-    reach = np.abs(near - near[np.argmax(above)]) <= per_cell // 2
-    centre = float((frequency[near] * above)[reach].sum() / above[reach].sum())
-    half = min(HALF_WIDTH, RELATIVE * centre)
-    band = np.abs(frequency - centre) <= half
-    beside = ~band & (np.abs(frequency - centre) <= 2 * half)
-    level = power[beside].mean(axis=0)
-    variance = np.maximum(power[band].sum(axis=0) - band.sum() * level, 0.0)
-    if missing.any():
-        # A line that is cut into pieces is convolved with the spectrum of the cuts: what of it stays in the band.
-        cuts = np.abs(fft.rfft((~missing[:length]).astype(np.float64)) / length) ** 2
-        inside = int(half * length / frame_rate)
-        variance /= cuts[0] + 2 * cuts[1 : inside + 1].sum()
-    return Vibration(centre, variance, significance)
+    def strength(peak: int) -> tuple[float, Floats]:
+        """Frequency and variance of the line in or beside a cell."""
+        # The line may lie on the border of two cells.
+        near = np.arange(max((peak - 1) * per_cell, 1), min((peak + 2) * per_cell, len(power)))
+        above = (power[near] / continuum[peak]).sum(axis=1)
+        reach = np.abs(near - near[np.argmax(above)]) <= per_cell // 2
+        centre = float((frequency[near] * above)[reach].sum() / above[reach].sum())
+        half = min(HALF_WIDTH, RELATIVE * centre)
+        band = np.abs(frequency - centre) <= half
+        beside = ~band & (np.abs(frequency - centre) <= 2 * half)
+        variance = np.maximum(power[band].sum(axis=0) - band.sum() * power[beside].mean(axis=0), 0.0)
+        if missing.any():
+            # A line that is cut into pieces is convolved with the spectrum of the cuts: what of it stays in the band.
+            cuts = np.abs(fft.rfft((~missing[:length]).astype(np.float64)) / length) ** 2
+            inside = int(half * length / frame_rate)
+            variance /= cuts[0] + 2 * cuts[1 : inside + 1].sum()
+        return centre, variance
+
+    middles = (np.arange(cells) + 0.5) * per_cell * frame_rate / length
+
+    def line_at(expected: float, uncertainty: float) -> tuple[float, Floats] | None:
+        """Frequency and variance of a line where one is expected."""
+        close = np.flatnonzero(searched & (np.abs(middles - expected) <= CELL + uncertainty))
+        if not close.size:
+            return None
+        peak = int(close[np.argmax(excess[close])])
+        chance = float(gammaincc(degrees, degrees * excess[peak])) * close.size
+        return strength(peak) if chance <= FALSE_ALARM else None
+
+    centre, variance = strength(peak)
+    for divisor in (2, 3):
+        below = line_at(centre / divisor, CELL / 2)
+        if below is not None and below[1].sum() > variance.sum():
+            centre, variance = below
+            break
+    harmonics, lines = none.copy(), [centre]
+    for number, multiple in enumerate(HARMONICS):
+        alias = abs((multiple * centre + frame_rate / 2) % frame_rate - frame_rate / 2)
+        if min(abs(alias - line) for line in lines) < 2 * HALF_WIDTH:
+            continue
+        # The frequency is known to half a cell at worst.
+        found = line_at(alias, multiple * CELL / 2)
+        if found is not None:
+            lines.append(found[0])
+            harmonics[number] = found[1]
+    return Vibration(centre, variance, significance, harmonics)
 
 
 def cells(frame_rate: float) -> Floats:
     """Middles of the cells of :func:`spectrum`, Hz: equally wide up to half the frame rate, at most `MOST_CELLS`."""
     count = int(frame_rate / 2 / _width(frame_rate))
-    return (np.arange(max(count, 1)) + 0.5) * _width(frame_rate)
+    return np.asarray((np.arange(max(count, 1)) + 0.5) * _width(frame_rate), dtype=np.float64)
 
 
 def spectrum(tilt: NDArray[np.floating], frame_rate: float) -> Floats:

@@ -166,6 +166,7 @@ def product(
         "slope_spectrum": spectrum,
         "vibration_frequency": np.full(batches, 50.0),
         "vibration_variance": np.tile([1e-12, 4e-12], (batches, 1)),
+        "vibration_harmonic_variance": np.tile([[1e-13, 4e-13], *[[0.0, 0.0]] * 3], (batches, 1, 1)),
         "zernike_variance": noll * np.exp(0.2 * random.standard_normal(noll.shape)),
         "zernike_variance_kolmogorov": noll,
         "log_amplitude_count": np.rint(1e5 * 0.01 * np.exp(-((chi / deviation[..., None]) ** 2) / 2)

@@ -105,10 +105,11 @@ def test_direct_r0_is_that_of_the_extended_source(
 
 
 def test_log_amplitude(reduced: batch.ReducedBatch, shared_truth: dict[str, Any]) -> None:
-    """sigma_I^2 of the truth makes sigma_chi = sqrt(ln(1 + sigma_I^2) / 4) in log-normal light: 5 % for its tails."""
+    """sigma_I^2 of the truth makes sigma_chi = sqrt(ln(1 + sigma_I^2) / 4) in log-normal light: 5 % for its tails,
+    and 1 % for what a window sees less of wider spots."""
     index = np.array(shared_truth["sigma_I2"]["of_this_record_per_source"])
     arrays = reduced.arrays
-    np.testing.assert_allclose(arrays["log_amplitude_deviation"], np.sqrt(np.log1p(index) / 4), rtol=0.05)
+    np.testing.assert_allclose(arrays["log_amplitude_deviation"], np.sqrt(np.log1p(index) / 4), rtol=0.06)
     np.testing.assert_allclose(arrays["log_amplitude_mean"], -(arrays["log_amplitude_deviation"] ** 2), rtol=0.05)
     assert (arrays["log_amplitude_distance"] < 0.02).all()
 

@@ -91,8 +91,10 @@ def test_scintillation_index(
     found, _, flux, _ = measured
     noise, _ = detection_noise(recording.header, found, flux, shared_truth["noise"]["background_counts"])
     index = (flux.var(axis=0) / flux.mean(axis=0) ** 2).mean(axis=-1) - noise
-    # The same frames: no statistical error, only what the window cuts off and what the other source adds.
-    np.testing.assert_allclose(index, shared_truth["sigma_I2"]["of_this_record_per_source"], rtol=0.02)
+    # The same frames: no statistical error. Of light that is spread over a wider spot the window sees less, which gives
+    # relative fluxes a gain of 1.01 (docs/extraction.md), so the index one of 1.02.
+    ratio = index / np.array(shared_truth["sigma_I2"]["of_this_record_per_source"])
+    assert ((ratio > 1.0) & (ratio < 1.035)).all(), ratio
 
 
 def test_slope_variance(

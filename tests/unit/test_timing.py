@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from coslidar.pipeline import batch, correlation, timing
+from coslidar.pipeline import batch, correlation, timing, vibration
 from coslidar.pipeline.extraction import FLAGS
 from coslidar.pipeline.geometry import Geometry
 from coslidar.pipeline.parameters import CorrelationParameters
@@ -249,7 +249,8 @@ def test_vibration_is_recorded_and_subtracted_on_request() -> None:
 def test_quiet_batch_raises_no_flag_and_fits_the_schema() -> None:
     result = reduce(measurements())
     assert flags(result) == expected_flags()
-    sizes = {"source": 2, "axis": 2, "axis_kind": 3, "radial_order": 5, "log_amplitude": 200}
+    sizes = {"source": 2, "axis": 2, "axis_kind": 3, "harmonic": 4, "radial_order": 5, "log_amplitude": 200}
+    sizes["frequency"] = len(vibration.cells(RATE))
     for name, value in result.arrays.items():
         if name in SCHEMA:
             variable = SCHEMA[name]

@@ -45,6 +45,27 @@ def test_line_above_half_the_rate_shows_at_its_alias() -> None:
     assert found.variance == pytest.approx([2e-12, 2e-12], rel=0.03)
 
 
+def test_harmonics_are_found_at_their_aliases() -> None:
+    """31 Hz and twice that, and four times, which 142 Hz show at 18 Hz; nothing at three and five times."""
+    shaken = tilt(2800, 6) + line(2800, 31.0, (4e-12, 4e-12))
+    alone = find_line(shaken, RATE)
+    found = find_line(shaken + line(2800, 62.0, (1e-12, 2e-12)) + line(2800, 124.0, (5e-13, 1e-12)), RATE)
+    assert found.frequency == pytest.approx(31.0, abs=0.05)
+    assert found.variance == pytest.approx(alone.variance, rel=0.01)
+    assert not alone.harmonics.any()
+    assert found.harmonics[0] == pytest.approx([1e-12, 2e-12], rel=0.03)
+    # Interference with the continuum at 18 Hz, as above.
+    assert found.harmonics[2] == pytest.approx([5e-13, 1e-12], abs=1e-13)
+    assert not found.harmonics[[1, 3]].any()
+
+
+def test_a_harmonic_on_another_line_counts_once() -> None:
+    """Half of 142 Hz is 71: the third of 35.5 Hz, at 106.5, is its own alias."""
+    found = find_line(tilt(2800, 7) + line(2800, 35.5, (4e-12, 4e-12)), RATE)
+    assert found.variance == pytest.approx([4e-12, 4e-12], rel=0.03)
+    assert not found.harmonics.any()
+
+
 def test_wandering_phase() -> None:
     """A phase that walks makes a Lorentzian of half width g: (2 / pi) arctan(2 Hz / g) of it within 2 Hz, less what the
     wings add to the level beside: arctan(4 Hz / g) - arctan(2 Hz / g)."""
