@@ -74,6 +74,9 @@ def draw_scatter(ax: Axes, pairs: Sequence[Pair]) -> Axes:
     """Draw emulated against measured Cn2 with both errors, and the line of equality."""
     from matplotlib.ticker import NullFormatter
 
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_autoscale_on(False)  # the limits below hold for both axes, also of a single point
     low, high = np.inf, 0.0
     for index, pair in enumerate(pairs):
         with np.errstate(invalid="ignore"):
@@ -85,8 +88,6 @@ def draw_scatter(ax: Axes, pairs: Sequence[Pair]) -> Axes:
         ax.errorbar(x, y, np.nan_to_num(pair.ours_error[both]), np.nan_to_num(pair.theirs_error[both]), color=colour,
                     ls="", marker=marker, ms=5, elinewidth=0.8, label=pair.name)  # fmt: skip
         low, high = min(low, x.min(), y.min()), max(high, x.max(), y.max())
-    ax.set_xscale("log")
-    ax.set_yscale("log")
     if high > 0:
         ends = np.array([low / 1.4, high * 1.4])
         ax.plot(ends, ends, color=MUTED, lw=1, zorder=0)
