@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -255,6 +256,23 @@ def test_nothing_but_reading(server: Server, folder: Path) -> None:
     assert sqlite3.connect(folder / "catalog.sqlite").execute("select count(*) from batch").fetchone() == (9,)
 
 
+@pytest.mark.slow
+def test_a_browser_shows_the_pages_without_a_complaint(server: Server, tmp_path: Path) -> None:
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no chromium: the pages are not opened in a browser")
+    for path, content in (("/", 'id="batches"'), ("/product/1/batch/0", "<svg"), ("/compare?a=1&b=2", "<svg")):
+        address = f"{server.base}{path}{'&' if '?' in path else '?'}token={server.token}"
+        done = subprocess.run(
+            [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
+             f"--user-data-dir={tmp_path / 'profile'}", address],
+            check=True, capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+        # A violated policy, an error of the script and a request that was refused are all written to the console.
+        assert "CONSOLE" not in done.stderr, path
+        assert content in done.stdout, path
+
+
 def test_what_is_not_there_is_said(server: Server) -> None:
     assert "has no product 99" in server.page("/product/99", 404)
     assert "there is no number 7" in server.page("/product/1/batch/7", 404)
@@ -266,8 +284,6 @@ def test_what_is_not_there_is_said(server: Server) -> None:
 def test_a_damaged_product_is_an_answer(
     started: Callable[..., subprocess.Popen[str]], folder: Path, tmp_path: Path
 ) -> None:
-    import shutil
-
     shutil.copytree(folder, tmp_path / "results")
     with open_catalog(tmp_path / "results") as catalog:
         row = next(row for row in catalog.products() if row.id == 1)
