@@ -7,12 +7,12 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-all docs bench bench-chain lint dev constraints clean
+.PHONY: help demo test test-all test-postgresql docs bench bench-chain lint dev constraints clean
 
 help:
 	@echo "make demo      install, simulate a small recording, profile it, draw a report"
 	@echo "make test      install and run the test suite"
-	@echo "make test-all  the same with the slow science checks"
+	@echo "make test-all  the same with the slow science checks;  make test-postgresql: the catalog on a server of its own"
 	@echo "make docs      the documentation as pages, docs/_build/html/index.html"
 	@echo "make bench     every benchmark, as ratios;  make bench-chain: chain against reading"
 	@echo "make lint      ruff and mypy;  make dev: what an editor needs"
@@ -55,6 +55,11 @@ test: $(VENV)/.test
 
 test-all: $(VENV)/.test
 	@$(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
+
+test-postgresql: $(VENV)/.test
+	@server=$$(mktemp -u /tmp/coslidar-postgresql.XXXXXXXX); trap '.ci/postgresql stop '$$server EXIT; \
+	  url=$$(.ci/postgresql start $$server) && COSLIDAR_TEST_POSTGRESQL=$$url $(BIN)/python -m pytest -q \
+	  tests/unit/test_catalog*.py tests/flows/test_catalog_commands.py -k postgresql $(PYTEST_ARGS)
 
 $(VENV)/.docs: $(VENV)/.core
 	@echo "installing what builds the documentation ..."

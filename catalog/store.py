@@ -505,8 +505,18 @@ class Catalog(RunLog, Releases, Upkeep):
     def provenance(self, row: ProductRow) -> dict[str, Any]:
         """PROV-JSON of a product together with the run that published it."""
         written = json.loads(self.open(row).attrs["provenance"])
-        runs = [] if row.run is None else [found for found in self.runs() if found.id == row.run]
-        return records.with_run(written, vars(runs[0]), row.lineage_key) if runs else dict(written)
+        made = self.made_by(row)
+        return dict(written) if made is None else records.with_run(written, vars(made), row.lineage_key)
+
+    def made_by(self, row: ProductRow) -> RunRow | None:
+        """Run that published a product; None where none is known."""
+        return next((found for found in self.runs() if found.id == row.run), None) if row.run else None
+
+    def lineage(self, row: ProductRow) -> dict[str, Any]:
+        """Lineage document of a product, as its file has it, which may be damaged or gone."""
+        query = sa.select(lineage.c.document).where(lineage.c.key == row.lineage_key)
+        with self.database.read() as connection:
+            return dict(connection.execute(query).scalar_one())
 
     def _find_one(self, identity: str, key: str) -> ProductRow | None:
         check_digest(identity, "archive_identity")

@@ -7,12 +7,9 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
-
-import sqlalchemy as sa
+from typing import TYPE_CHECKING, Any
 
 from ..catalog.archive import ArchiveError
-from ..catalog.tables import lineage, run
 from ..pipeline.units import safe
 from ..plugins.registry import PluginError
 from .plan import plan_archive
@@ -22,8 +19,6 @@ from .settings import InputError, load
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from xarray import Dataset
 
     from ..catalog.store import Catalog, ProductRow
 
@@ -69,17 +64,12 @@ def repair(catalog: Catalog, row: ProductRow, folder: Path | None = None) -> Rep
     Repair
     """
     url, header = catalog.recording(row)
-    with catalog.database.read() as connection:
-        document = connection.execute(
-            sa.select(lineage.c.document).where(lineage.c.key == row.lineage_key)
-        ).scalar_one()
-        made = connection.execute(sa.select(run.c.configuration, run.c.commit).where(run.c.id == row.run)).one_or_none()
-    configuration, commit = made if made is not None else ({}, "")
-    begin = folder if folder is not None else Path(configuration.get("folder") or ".")
+    document, made = catalog.lineage(row), catalog.made_by(row)
+    begin = folder if folder is not None else Path((made.configuration.get("folder") if made else None) or ".")
     place = url if "://" in url else str(begin / url)
     why = tuple(differences({node["stage"]: node for node in document["nodes"].values()}))
     try:
-        settings = _settings(catalog, row, document, place, header, commit)
+        settings = _settings(catalog, row, document, place, header, made.commit if made else "")
         planned = plan_archive(place, settings)
     except (ArchiveError, InputError, PluginError) as error:
         return Repair(row, False, reasons=(*error.faults, *why))
@@ -117,7 +107,7 @@ def _settings(
         "lineage": json.dumps(document),
         "provenance": json.dumps({"agent": {"coslidar:software": {"prov:label": "", "coslidar:commit": commit}}}),
     }
-    lost = cast("Dataset", SimpleNamespace(attrs=attributes))
+    lost: Any = SimpleNamespace(attrs=attributes)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "repair.toml"
         file.write_text(campaign_file(lost, url, header, str(catalog.root)), encoding="utf-8")

@@ -148,7 +148,7 @@ def kill_rounds(kind, folder, rounds, publishers):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_killed_publishers(kind, tmp_path):
-    published, _ = kill_rounds(kind, tmp_path, rounds=4, publishers=2)
+    published, _ = kill_rounds(kind, tmp_path, rounds=3, publishers=2)
     assert published > 0
 
 
