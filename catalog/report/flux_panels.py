@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...pipeline.comparison import Pair
-from .reading import DAY, bounds, edges, listed, values
+from .reading import DAY, Floats, bounds, edges, listed, values
 from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, figure_style
 from .time_panels import _frame, _join, _visible, time_axis
 from .words import clean, number, scientific
@@ -44,9 +44,9 @@ def pairs_in(datasets: Sequence[Dataset]) -> list[Pair]:
             )
     pairs = []
     for name, parts in found.items():
-        limit, *columns = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(limit[:, 0], kind="stable")
-        pairs.append(Pair(name, limit[order], *(column[order] for column in columns)))
+        whole = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        order = np.argsort(whole[0][:, 0], kind="stable")
+        pairs.append(Pair(name, *(column[order] for column in whole)))
     return pairs
 
 
@@ -173,6 +173,13 @@ def describe_agreement(datasets: Sequence[Dataset]) -> str:
     return " ".join(parts) or "No product names a scintillometer."
 
 
+def _median(found: Floats) -> Floats:
+    """Median over the first axis of what is finite."""
+    with np.errstate(invalid="ignore"):
+        middle = np.ma.median(np.ma.masked_invalid(found), axis=0)  # type: ignore[no-untyped-call]
+    return np.asarray(np.ma.filled(middle.astype(float), np.nan))
+
+
 def draw_heat_flux(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     """Draw the sensible heat flux over time and distance; blank where there is none."""
     products = listed(datasets)
@@ -192,7 +199,7 @@ def draw_heat_flux(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     if image is not None:
         bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
         bar.set_label(r"$H$ (W m$^{-2}$), upward")
-        bar.outline.set_linewidth(0.6)  # type: ignore[operator]
+        bar.outline.set_linewidth(0.6)
     return ax
 
 
@@ -203,13 +210,9 @@ def draw_slice_flux(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     border = edges(dataset)
     centre = (border[1:] + border[:-1]) / 2
 
-    def median(name: str) -> Any:
-        parts = [
-            part for one in products if (part := values(one, name)) is not None and part.shape[1:2] == centre.shape
-        ]
-        with np.errstate(invalid="ignore"):
-            whole = np.ma.median(np.ma.masked_invalid(np.concatenate(parts)), axis=0)
-        return np.ma.filled(whole.astype(float), np.nan)
+    def median(name: str) -> Floats:
+        found = [values(one, name) for one in products]
+        return _median(np.concatenate([part for part in found if part is not None and part.shape[1] == centre.size]))
 
     flux, interval = median("sensible_heat_flux"), median("sensible_heat_flux_interval_68")
     ax.stairs(flux, border, color=RED, lw=1.8, label="similarity, with 68 % interval", baseline=None)
@@ -256,14 +259,13 @@ def draw_height_model(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     """Draw the median profile beside Cn2 that goes as (height above ground)^(-4/3) (Sauvage et al. 2021, Fig. 14)."""
     dataset = listed(datasets)[0]
     border = edges(dataset)
-    for name, style in (
-        ("cn2", {"color": RED, "lw": 1.8, "label": "profiles, median"}),
-        ("cn2_height_model", {"color": INK, "lw": 1.5, "ls": "--", "label": r"$h^{-4/3}$, same $r_0$"}),
+    for name, colour, dashes, label in (
+        ("cn2", RED, "-", "profiles, median"),
+        ("cn2_height_model", INK, "--", r"$h^{-4/3}$, same $r_0$"),
     ):
         found = values(dataset, name)
         if found is not None and np.isfinite(found).any():
-            whole = np.ma.median(np.ma.masked_invalid(found), axis=0)
-            ax.stairs(np.ma.filled(whole.astype(float), np.nan), border, baseline=None, **style)
+            ax.stairs(_median(found), border, baseline=None, color=colour, ls=dashes, lw=1.8, label=label)
     ax.set_yscale("log")
     ax.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
     ax.legend(loc="best", fontsize=10)

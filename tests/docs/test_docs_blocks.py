@@ -15,6 +15,7 @@ from page_blocks import LANGUAGES, ROOT, Block, Runner, blocks, differs, environ
 ELSEWHERE = {
     "docs/plugins.md": "tests/unit/test_docs_plugins.py",
     "docs/ingest.md": "tests/docs/test_docs_ingest.py",
+    "docs/fluxes.md": "tests/docs/test_docs_fluxes.py",
 }
 #: Pages that are executed among the quick tests; all others, also new ones, are slow.
 QUICK = ("README.md", "docs/howto/reprocessing.md", "docs/resolution.md", "docs/archive.md")
