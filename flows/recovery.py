@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..pipeline import batch, turbulence
+from ..pipeline import batch, strong_scintillation, turbulence
 from ..pipeline.extraction import Calibration
 from ..pipeline.products import Measurements
-from ..pipeline.response import response_matrix
 from .settings import InputError, load, with_plugin
 from .simulate import CHUNK_FRAMES, recordings
 
@@ -209,20 +208,19 @@ def recover(
         raise InputError(["correlation.sources: this experiment uses all sources of a scenario; leave it out"])
     if configuration.response.grid(geometry).edges != grid.edges:
         raise InputError(["response.slices and response.extent: a profile is compared slice by slice; leave them out"])
+    sampling = configuration.response.sampling
+    matrices = strong_scintillation.responses(
+        geometry, grid, settings.spectrum(), settings.source_models(header, "scenario"), configuration.response
+    )
     model = batch.Model(
         geometry=geometry,
         grid=grid,
-        matrix=response_matrix(
-            geometry,
-            grid,
-            settings.spectrum(),
-            settings.source_models(header, "scenario"),
-            **configuration.response.options(geometry),
-        ),
-        sampling=configuration.response.sampling,
+        matrix=matrices["M"],
+        sampling=sampling,
         regulariser=settings.regulariser(),
         selector=settings.selector(),
         inversion=configuration.inversion,
+        strong=strong_scintillation.from_responses(matrices, geometry, grid, sampling),
     )
 
     def one(number: int) -> tuple[Floats, BatchResult]:
