@@ -603,3 +603,46 @@ def test_inputs_are_left_alone() -> None:
     second = extract(raw[:, :, :], replace(found), calibration, DEFAULT)
     for a, b in zip(first, second, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("method", "worst", "spread"),
+    # A threshold makes pixels come and go as a spot moves; a fit with the mean spot, which is broader by the wander of
+    # the spots, loses light.
+    [("thresholded", 0.06, 0.002), ("weighted", 0.03, 0.002), ("template", 0.03, 0.03)],
+)
+def test_other_methods_on_everything_a_detector_does(method: Any, worst: float, spread: float) -> None:
+    head = header()
+    frames, move, light = recording(head, 60, seed=50, wander=0.3)
+    rng = np.random.default_rng(51)
+    dark = (600 + 30 * rng.standard_normal(frames.shape[1:])).astype(np.float32)
+    flat = (1 + 0.05 * rng.standard_normal(frames.shape[1:])).astype(np.float32)
+    bad = np.zeros(frames.shape[1:], dtype=bool)
+    bad[11, 18] = bad[20, 32 + 13] = True
+    raw = (frames * flat + dark).astype(np.float32)
+    raw[:, bad] = np.nan
+    parameters = ExtractionParameters(method=method)
+    calibration = Calibration(dark=dark, flat=flat, bad_pixel=bad, saturation=3500.0)
+    found = prepare(head, np.nan_to_num(raw), calibration, parameters)
+    spoilt = raw.copy()
+    spoilt[3, :32, :32] = dark[:32, :32]
+    spoilt[4, 9, 15] = np.nan
+    spoilt[5, 10, 15] = 4000.0
+    slopes, flux, flag = extract(spoilt, found, calibration, parameters)
+    others = sum(FLAGS.values()) - FLAGS["saturated"]
+    assert flag[3, :, 0].all()
+    assert flag[4, 0, 0] & others
+    assert np.isnan(slopes[3:5, :, 0, 0]).all()
+    assert np.isnan(flux[3:5, 0, 0]).all()
+    assert flag[5, 0, 0] & FLAGS["saturated"]
+    slopes, flux, flag = extract(raw, found, calibration, parameters)
+    assert not (flag & others).any()
+    error = slopes / SCALE - move
+    error -= error.mean(axis=0)
+    # The replaced pixels are worth 0.02 px, as in the sub-pixel window.
+    assert np.abs(error).max() < worst
+    ratio = flux / light
+    assert (ratio / ratio.mean()).std() < spread + 0.005
+    for part in (slice(0, 7), slice(7, 60)):
+        for whole, cut in zip((slopes, flux, flag), extract(raw[part], found, calibration, parameters), strict=True):
+            np.testing.assert_array_equal(whole[part], cut)
