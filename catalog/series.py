@@ -442,7 +442,9 @@ def _read_csv(path: Path, origin: str, reading: Reading) -> _Table:
     ]
     if faults:
         raise SeriesError(faults[:5] + ([f"{origin}: and {len(faults) - 5} more"] if len(faults) > 5 else []))
-    zone = _zone(reading.timezone, origin) if reading.timezone is not None else None
+    # 'time (UTC)' says its zone where its values do not.
+    named = reading.timezone or parts[times[0]][1]
+    zone = _zone(named, origin) if named else None
     stamps = _instants([row[times[0]] for row in body], zone, origin, kept[1][0])
     start, stop = _intervals(stamps, reading, origin)
     columns = {}

@@ -44,6 +44,16 @@ INTERFACE = {
         "coslidar.pipeline.turbulence",
         "coslidar.pipeline.units",
     ),
+    "From optics to fluxes": (
+        "coslidar.catalog.series",
+        "coslidar.pipeline.timeseries",
+        "coslidar.pipeline.comparison",
+        "coslidar.pipeline.scintillometer",
+        "coslidar.pipeline.air",
+        "coslidar.pipeline.surface_layer",
+        "coslidar.pipeline.terrain",
+        "coslidar.pipeline.optical_parameters",
+    ),
     "Runs": ("coslidar.flows.settings", "coslidar.flows.run"),
     "Figures": ("coslidar.catalog.report",),
 }

@@ -72,6 +72,19 @@ name = "gcv"                        # or "fixed" with mu = "1e27 m^(4/3)", ...
 # What the archives' headers lack or have wrong can be put right here, with the same keys:
 # [path]
 # length = "2670 m"
+
+# Other instruments, weather and terrain make comparisons and heat fluxes of the profiles (docs/fluxes.md):
+# [[scintillometers]]
+# name = "A"
+# wavelength = "0.88 um"
+# diameters = ["5 cm", "14.5 cm"]     # at the pupil's end and at the sources' end
+# series = {file = "las.csv"}         # Scintec .mnd, NetCDF, or CSV with units
+# [meteorology]
+# file = "weather.csv"
+# [terrain]
+# file = "transect.csv"
+# pupil_height = "20 m"
+# sources_height = "25 m"
 """
 
 

@@ -115,6 +115,13 @@ def test_local_time_and_the_hour_that_comes_twice(tmp_path: Path) -> None:
     assert (fixed.stop - fixed.start).tolist() == [600 * 10**9] * 2
 
 
+def test_a_heading_that_names_the_zone(tmp_path: Path) -> None:
+    found = read_series(
+        written(tmp_path, "time (UTC),Cn2 (m^(-2/3))\n2012-09-14T12:00:00,1e-14\n2012-09-14T12:01:00,1e-14\n")
+    )
+    assert found.start[0] == np.datetime64("2012-09-14T12:00", "ns").astype(int)
+
+
 def test_missing_and_impossible_values(tmp_path: Path) -> None:
     text = "# remark\ntime,Cn2 [m^(-2/3)]\n" + "".join(
         f"2012-09-14T12:0{i}Z,{value}\n" for i, value in enumerate(["1e-14", "", "NaN", "-9.99", "0"])
