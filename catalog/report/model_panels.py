@@ -9,8 +9,8 @@ import numpy as np
 from ...pipeline.products import INTENSITY_KINDS, SLOPE_KINDS
 from .batch_panels import cn2_limits, draw_profile, note
 from .reading import Floats, edges, log_mu, of_batch, scalar
-from .style import BLUE, INK, MUTED, PAPER, RED, SEQUENTIAL
-from .words import number, scientific
+from .style import BLUE, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
+from .words import clean, number, scientific
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,9 +104,9 @@ def draw_sensitivity(ax: Axes, dataset: Dataset) -> Axes:
 def compose_response(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out responses of scintillation and slopes, and the sensitivity against distance."""
     dataset = _described(datasets)
-    for place, item in zip(((0.085, 0.575, 0.395, 0.36), (0.585, 0.575, 0.395, 0.36)), _AUTO, strict=True):
+    for place, item in zip(((0.115, 0.575, 0.375, 0.36), (0.605, 0.575, 0.375, 0.36)), _AUTO, strict=True):
         draw_response(figure.add_axes(place), dataset, *item)
-    draw_sensitivity(figure.add_axes((0.085, 0.1, 0.895, 0.32)), dataset)
+    draw_sensitivity(figure.add_axes((0.115, 0.1, 0.865, 0.32)), dataset)
 
 
 def _described(datasets: Sequence[Dataset]) -> Dataset:
@@ -126,6 +126,50 @@ def describe_response(datasets: Sequence[Dataset]) -> str:
             parts.append(f"{label}: largest at {number(float(z[np.nanargmax(variance)]), 4)} m, smallest at "
                          f"{number(float(z[np.nanargmin(variance)]), 4)} m")  # fmt: skip
     return f"Variance per Cn²dz, {'; '.join(parts)}." if parts else "The products do not hold their response functions."
+
+
+#: Marker and dashes of each scintillometer.
+_WEIGHTS = (("s", (0, (5, 2)), GREEN), ("o", (0, (1, 1.5)), RED), ("^", (0, (6, 2, 1, 2)), PURPLE))
+
+
+def _weighted(datasets: Sequence[Dataset]) -> Dataset | None:
+    return next((dataset for dataset in datasets if dataset.sizes.get("scintillometer", 0)
+                 and "scintillometer_weight" in dataset), None)  # fmt: skip
+
+
+def compose_weights(figure: Figure, datasets: Sequence[Dataset]) -> None:
+    """Lay out the weight of each slice in the Cn2 of each scintillometer."""
+    ax = figure.add_axes((0.085, 0.19, 0.895, 0.76))
+    dataset = _weighted(datasets)
+    if dataset is None:
+        note(ax, "no scintillometers")
+        return
+    z = np.asarray(dataset["z"].values, np.float64)
+    # Per length of path, relative to the mean: slices may differ in thickness.
+    border = edges(dataset)
+    weights = np.asarray(dataset["scintillometer_weight"].values, np.float64) / np.diff(border)
+    for number_, (name, row) in enumerate(zip(dataset["scintillometer"].values, weights, strict=True)):
+        marker, dashes, colour = _WEIGHTS[number_ % len(_WEIGHTS)]
+        shown = clean(name)[:24].replace("$", r"\$")
+        ax.plot(z, row * (border[-1] - border[0]), color=colour, marker=marker, mfc=PAPER, ls=dashes, label=shown)
+    ax.set_xlim(border[0], border[-1])
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("distance from the pupil z (m)")
+    ax.set_ylabel("weight / mean weight")
+    ax.grid(axis="y")
+    ax.legend(loc="upper right")
+
+
+def describe_weights(datasets: Sequence[Dataset]) -> str:
+    """Say where along the path each scintillometer looks."""
+    dataset = _weighted(datasets)
+    if dataset is None:
+        return "The recording's header names no scintillometer."
+    z = np.asarray(dataset["z"].values, np.float64)
+    weights = np.asarray(dataset["scintillometer_weight"].values, np.float64)
+    parts = [f"{clean(name)}: centre of weight at {number(float(row @ z / row.sum()), 4)} m"
+             for name, row in zip(dataset["scintillometer"].values, weights, strict=True)]  # fmt: skip
+    return "; ".join(parts) + "."
 
 
 def compose_other_mu(figure: Figure, dataset: Dataset, batch: int) -> None:

@@ -268,6 +268,16 @@ TIME_PANELS = (
         ("sensible_heat_flux",),
     ),
     TimePanel(
+        "weights",
+        "Where along the path does each scintillometer look?",
+        "Weight of the turbulence at each distance in the Cn² of the instrument, relative to its mean: the end with "
+        "the smaller aperture counts more.",
+        (10.0, 3.4),
+        model.compose_weights,
+        model.describe_weights,
+        ("scintillometer_weight",),
+    ),
+    TimePanel(
         "response",
         "What do the data answer to, and from where?",
         "Above: correlation that Cn²dz = 1 m^(1/3) in one slice makes, along dy at dx = 0; the numbers count the "

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from ..chosen import Chosen
 
 #: Format -> ending of its files.
-_ENDINGS = {"csv": "csv", "netcdf": "nc", "parquet": "parquet", "aot": "fits"}
+_ENDINGS = {"csv": "csv", "parquet": "parquet", "netcdf": "nc", "aot": "fits"}
 
 
 def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
