@@ -18,6 +18,7 @@ _CAMPAIGN = """\
 {campaign}archives = {archives}
 output = "results"                  # folder of the catalog and its products
 # preset = "sauvage-2021"           # settings of the published campaign, under all that this file says
+# keep = ["measurements"]           # slopes and fluxes too, 1 kB a frame: other correlations then read no frame
 
 [batch]
 duration = "{duration}"             # averaging window of one profile

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from small_clusters import Cluster
 from small_runs import ARCHIVES, Finished, command, environment, family, scenario
 
 from coslidar.flows.simulate import simulate
@@ -128,3 +129,13 @@ def main_here(
         return Finished(int(leave.value.code or 0), said.out, said.err, time.monotonic() - begin)
 
     return call
+
+
+@pytest.fixture
+def dask(tmp_path: Path, cache: Path) -> Iterator[Cluster]:
+    """A scheduler without workers."""
+    folder = tmp_path / "dask"
+    folder.mkdir()
+    made = Cluster(folder, cache)
+    yield made
+    made.close()

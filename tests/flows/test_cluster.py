@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import socket
 import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import psutil
 import pytest
-from small_runs import ARCHIVES, BATCHES, SETTINGS, Finished, environment, family, products, run_arguments, wait_for
+from small_clusters import Cluster
+from small_runs import ARCHIVES, BATCHES, SETTINGS, Finished, products, run_arguments, wait_for
 
 from coslidar.catalog import open_catalog
 from coslidar.flows import cluster, tasks
@@ -22,59 +22,6 @@ from coslidar.flows.settings import RunParameters, Unavailable, load
 
 TOTAL = len(ARCHIVES) * BATCHES
 Call = Callable[..., Finished]
-
-
-class Cluster:
-    """A scheduler and its workers, each a process."""
-
-    def __init__(self, folder: Path, cache: Path) -> None:
-        self.folder, self.cache = folder, cache
-        self.processes: list[subprocess.Popen[bytes]] = []
-        self.file = folder / "scheduler.json"
-        with socket.socket() as probe:
-            probe.bind(("127.0.0.1", 0))
-            self.address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
-        self.scheduler = self.start(
-            "scheduler", "--host", "127.0.0.1", "--port", self.address.rsplit(":", 1)[1], "--no-dashboard",
-            "--scheduler-file", str(self.file),
-        )  # fmt: skip
-        assert wait_for(self.file.exists, 60)
-
-    def start(self, what: str, *arguments: str) -> subprocess.Popen[bytes]:
-        log = (self.folder / f"{what}-{len(self.processes)}.log").open("wb")
-        process = subprocess.Popen(
-            [sys.executable, "-m", "distributed.cli.dask_" + what, *arguments],
-            stdout=log,
-            stderr=log,
-            cwd=self.folder,
-            env=environment(self.cache, OMP_NUM_THREADS="1"),
-        )
-        log.close()
-        self.processes.append(process)
-        return process
-
-    def worker(self, *arguments: str) -> subprocess.Popen[bytes]:
-        return self.start(
-            "worker", self.address, "--host", "127.0.0.1", "--no-dashboard", "--nworkers", "1", "--nthreads", "1",
-            *arguments,
-        )  # fmt: skip
-
-    def close(self) -> None:
-        for process in self.processes:
-            for one in family(process.pid):
-                one.kill()
-            process.kill()
-            process.wait()
-
-
-@pytest.fixture
-def dask(tmp_path: Path, cache: Path) -> Iterator[Cluster]:
-    """A scheduler without workers."""
-    folder = tmp_path / "dask"
-    folder.mkdir()
-    made = Cluster(folder, cache)
-    yield made
-    made.close()
 
 
 @pytest.fixture(scope="module")

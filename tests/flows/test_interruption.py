@@ -13,6 +13,7 @@ import pytest
 from small_runs import ARCHIVES, BATCHES, FRAMES, Finished, family, products, run_arguments, wait_for
 
 from coslidar.catalog import open_catalog
+from coslidar.catalog.heartbeats import life
 
 BATCH_FRAMES = FRAMES // BATCHES
 TOTAL = len(ARCHIVES) * BATCHES
@@ -77,9 +78,13 @@ def test_kill_9(
     assert batches <= kept < TOTAL
     # What stands in the catalog is whole, whenever the kill came.
     assert published.items() <= undisturbed.items()
+    told = coslidar("status", "--out", out)
+    assert (told.code, ": lost\n" in told.out) == (0, True), told.out
+    assert f"cd {tmp_path} && " in told.out.splitlines()[-1]  # how to continue it
     finish(coslidar, arguments, out, undisturbed, kept)
     with open_catalog(out) as catalog:
         assert [run.state for run in catalog.runs()] == ["interrupted", "finished"]
+        assert [life(run) for run in catalog.runs()] == ["lost", "finished"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

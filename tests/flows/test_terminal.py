@@ -93,8 +93,9 @@ def test_plan_says_what_a_run_will_do(main_here: Main, recordings: list[str], tm
     before = main_here(*plan)
     assert before.code == 0
     assert re.fullmatch(
-        r"demo/r0: 4 batches to compute, 0 from kept correlations, 852 frames to read  \(key [0-9a-f]{16}\)\n"
-        r"in all 4 batches to compute, 852 frames to read\n",
+        r"demo/r0: 4 batches to compute; 852 frames to read, \d+ kB to write  \(key [0-9a-f]{16}\)\n"
+        r"in all 4 batches to compute, 852 frames to read, \d+ kB to write\n"
+        r"about \d+ s on \d+ threads?, no earlier run in this catalog tells .*\n",
         before.out,
     )
     assert not (tmp_path / "out").exists()
@@ -102,7 +103,7 @@ def test_plan_says_what_a_run_will_do(main_here: Main, recordings: list[str], tm
     after = main_here(*plan)
     assert after.out == ("demo/r0: 4 batches, in the catalog already\nin all 0 batches to compute, 0 frames to read\n")
     other = main_here(*plan, "--sampling", "midpoint", "--slices", "5")
-    assert "4 batches to compute, 4 from kept correlations, 0 frames to read" in other.out
+    assert "4 batches to compute, 4 from kept correlations; 0 frames to read" in other.out
 
 
 def test_options_and_settings_are_the_same(main_here: Main, recordings: list[str], tmp_path: Path) -> None:
