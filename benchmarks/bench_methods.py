@@ -7,7 +7,7 @@ Three tables, as they stand in docs/extraction.md:
    true centroid and flux, what remains, and chi2 per datum of the whole chain; the first line is the truth itself.
 3. With ``--sample``, a wave-optics recording: chi2 per datum of the whole chain.
 
-    python benchmarks/bench_methods.py [--frames 2000] [--keep FILE.npz] [--sample ARCHIVE]
+    python benchmarks/bench_methods.py [--frames 200] [--keep FILE.npz] [--sample ARCHIVE]
 """
 
 from __future__ import annotations
@@ -209,7 +209,7 @@ def test_the_default_answers_with_gain_one() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--frames", type=int, default=200)
     parser.add_argument("--drawn", type=int, default=400)
     parser.add_argument("--keep", type=Path, help="file that keeps the structured spots from one run to the next")
     parser.add_argument("--sample", help="wave-optics recording of the 5 x 5 instrument")
