@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-    from xarray import Dataset
 
     from ..pipeline.timeseries import TimeSeries
 
@@ -91,7 +90,7 @@ class _Batches:
     errors: Array
 
 
-def _emulated(datasets: Sequence[Dataset], one: Scintillometer) -> _Batches:
+def _emulated(datasets: Sequence[Any], one: Scintillometer) -> _Batches:
     parts: list[tuple[NDArray[np.int64], Array, Array]] = []
     for dataset in datasets:
         try:
@@ -116,7 +115,7 @@ def _emulated(datasets: Sequence[Dataset], one: Scintillometer) -> _Batches:
 
 
 def pairs_of(
-    datasets: Sequence[Dataset],
+    datasets: Sequence[Any],
     stations: Sequence[Station],
     *,
     average: float | None = None,
@@ -127,7 +126,7 @@ def pairs_of(
 
     Parameters
     ----------
-    datasets : sequence of Dataset
+    datasets : sequence of xarray.Dataset
         Products.
     stations : sequence of Station
         Scintillometers; those without a series get their emulated one only.
