@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import elementwise
 
 from .air import GRAVITY, KARMAN, heat_capacity, latent_heat
 
@@ -269,6 +268,8 @@ def solve(
     ValueError
         Neither wind nor friction velocity is given.
     """
+    from scipy.optimize import elementwise  # slow to import, and every campaign file names a similarity
+
     if wind is None and friction_velocity is None:
         raise ValueError("the similarity equations need the wind or the friction velocity; free_convection needs none")
     known = friction_velocity is not None
@@ -398,6 +399,8 @@ def effective_height(
     float
         z_eff in m; NaN where a slice with a weight has no height.
     """
+    from scipy.optimize import elementwise
+
     used = weights != 0
     h, w = heights[used], weights[used] / weights.sum()
     if not (h > 0).all():

@@ -17,7 +17,6 @@ from pydantic import Field, field_validator, model_validator
 from . import air, surface_layer
 from .comparison import compare
 from .parameters import Parameters, SeriesFile
-from .posterior import highest_density_interval
 from .scintillometer import log_amplitude_variance, saturation_limit
 from .timeseries import TimeSeries
 from .units import Angle, Length
@@ -378,6 +377,9 @@ def heat_fluxes(
         `temperature_scale`, `obukhov_length`, `flux_state` (index of :data:`FLUX_STATES`), `flux_solved_fraction` (part
         of the draws that have a solution), and the conditions.
     """
+    # Every command reads a campaign file, few compute: numba is slow to import.
+    from .posterior import highest_density_interval
+
     k = cn2.size
     similarity = surface_layer.SIMILARITIES[parameters.coefficients]
     z = heights - parameters.displacement_height
