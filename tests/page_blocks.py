@@ -6,7 +6,8 @@ The language of a block says what becomes of it:
   ``...`` alone on a line stands for any number of lines, at the end of one for its rest. Numbers with a point or an
   exponent need to agree only roughly (:data:`ROUGHLY`), and keys and durations not at all: a page shows what one
   sees, other tests hold the numbers.
-- `sh`: typed into a shell; has to succeed, what it prints is not looked at.
+- `sh`: typed into a shell; has to succeed, what it prints is not looked at. With a second word `long` it is not
+  executed: that its commands and options exist is checked. With `make` it is what CI does in a clean checkout.
 - `python`: executed, all blocks of a page one after the other in one namespace; `pycon` is a doctest in that namespace.
 - any of `toml`, `json`, `python`, `yaml`, `ini` whose first line is ``# folder/file``: is that file.
 - `toml`, `json` without: has to be readable.

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
+import shlex
 import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 from page_blocks import LANGUAGES, ROOT, Block, Runner, blocks, differs, environment, session
+
+from coslidar.flows.cli import cli
 
 #: Pages whose blocks another test executes, because they need more than the tutorial made.
 ELSEWHERE = {
@@ -82,10 +86,29 @@ def test_blocks_of_a_page(page: str, folder: Path, home: Path) -> None:
     for block in blocks(ROOT / page):
         if "make" in block.words:
             continue  # make demo, make test: what CI does in a clean checkout
+        if "long" in block.words:
+            check_options(block)  # hours, or data that are not everybody's
+            continue
         try:
             runner.run(block)
         except AssertionError as error:
             raise AssertionError(f"{page}, line {block.line}:\n{error}") from None
+
+
+def check_options(block: Block) -> None:
+    """Commands that take too long to be executed: they and their options are at least there."""
+    for line in block.body.replace("\\\n", " ").splitlines():
+        program, *words = shlex.split(line, comments=True) or [""]
+        if program != "coslidar":
+            continue
+        command: click.Command = cli
+        while isinstance(command, click.Group) and words:
+            found = command.get_command(click.Context(command), words.pop(0))
+            assert found is not None, f"line {block.line}: there is no such command: {line}"
+            command = found
+        known = {name for parameter in command.params for name in parameter.opts}
+        unknown = [word for word in words if word.startswith("-") and word.partition("=")[0] not in known]
+        assert not unknown, f"line {block.line}: there are no options {unknown}: {line}"
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -128,5 +151,8 @@ def test_the_comparison_can_fail() -> None:
     assert differs("a\nb\n", "a") == "(nothing more; the program went on with: b)"
     assert differs("", "a") == "a"
     assert list(session("$ one \\\n  two\nsaid\n$ three\n")) == [("one \\\n  two", "said"), ("three", "")]
+    check_options(Block("sh", ("long",), "coslidar run a.toml --no-prefect  # --nothing\n", 1))
+    with pytest.raises(AssertionError, match="--nothing"):
+        check_options(Block("sh", ("long",), "coslidar run a.toml --nothing\n", 1))
     assert Block("python", (), "# my/file.py\nx = 1\n", 1).file == "my/file.py"
     assert Block("python", (), "# a comment\nx = 1\n", 1).file is None
