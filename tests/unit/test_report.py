@@ -129,6 +129,7 @@ def test_a_figure_shows_the_data(panel: Any, many: xr.Dataset) -> None:
                  "response_intensity"):  # fmt: skip
         other[name] = other[name] * (1 + 0.3 * other[name] / other[name].max())
     other["response_intensity"] = other["response_intensity"] * np.linspace(1, 0.5, 12)
+    other["scintillometer_weight"] = other["scintillometer_weight"] * np.linspace(1, 0.5, 12)
     first, second = ink(report.figure(panel, many, 0)), ink(report.figure(panel, other, 0))
     assert first.shape == second.shape
     assert (first != 255).any(axis=-1).mean() > 0.01
@@ -208,6 +209,13 @@ def test_batches_are_picked_evenly(usable: list[bool], most: int, expected: list
     assert pick(usable, most) == expected
 
 
+@pytest.fixture
+def few_panels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two figures of a batch and two over time, for tests that are about the page around them."""
+    monkeypatch.setattr(report.page, "BATCH_PANELS", report.BATCH_PANELS[:2])
+    monkeypatch.setattr(report.page, "TIME_PANELS", report.TIME_PANELS[:2])
+
+
 # --- cases -------------------------------------------------------------------------------------------------
 
 
@@ -220,6 +228,7 @@ def test_a_single_batch_has_no_map_and_no_picker() -> None:
     assert page.rows[0][1][1] == "19.70"
 
 
+@pytest.mark.usefixtures("few_panels")
 def test_one_source_has_no_maps_between_sources() -> None:
     page = Page(report.render(product(1, sources=1)))
     assert "There are no maps between sources: one source was observed." in " ".join(page.text["p"])
@@ -229,12 +238,17 @@ def test_one_source_has_no_maps_between_sources() -> None:
 
 def test_nothing_but_failed_batches_is_said_and_not_drawn() -> None:
     page = Page(report.render(product(2, failed=(0, 1))))
+    # What does not depend on a batch is drawn nevertheless.
     assert [attributes["aria-label"] for attributes in page.all("svg")] == [
-        "What do the data answer to, and from where?", "Which batches need care?"]  # fmt: skip
+        "Where along the path does each scintillometer look?",
+        "What do the data answer to, and from where?",
+        "Which batches need care?",
+    ]
     assert "No batch has a profile" in " ".join(page.text["p"])
     assert [cell[1] for cell in page.rows[0][4:]] == ["–"] * 9
 
 
+@pytest.mark.usefixtures("few_panels")
 def test_several_products_are_put_in_order_even_with_other_slices() -> None:
     late = product(2, start=START + 3600 * 10**9, slices=9, attributes={"archive": "later"})
     early = product(2)
@@ -248,6 +262,7 @@ def test_several_products_are_put_in_order_even_with_other_slices() -> None:
     assert "12 slices" in text
 
 
+@pytest.mark.usefixtures("few_panels")
 def test_a_product_without_optional_variables_still_has_a_page() -> None:
     poor = product(3)[["time_bounds", "cn2", "quality_flag"]].drop_attrs()
     page = Page(report.render(poor, most_batches=1))
@@ -401,6 +416,7 @@ HOSTILE = (
 )
 
 
+@pytest.mark.usefixtures("few_panels")
 def test_hostile_text_is_shown_and_does_nothing() -> None:
     dataset = product(
         1,
@@ -428,6 +444,7 @@ def test_hostile_text_is_shown_and_does_nothing() -> None:
     assert "Local time" not in "".join(page.text["dt"])
 
 
+@pytest.mark.slow
 def test_the_same_products_give_the_same_bytes(tmp_path: Path) -> None:
     """Also in another process with another hash seed, time zone, locale and matplotlib settings."""
     report.write_report(product(2), tmp_path / "first.html", most_batches=1)
@@ -565,6 +582,7 @@ def test_the_report_on_paper_is_reproducible(tmp_path: Path) -> None:
     assert not re.search(rb"/JavaScript|/URI|/Launch", content)
 
 
+@pytest.mark.slow
 def test_pictures_have_names_and_words(tmp_path: Path) -> None:
     from PIL import Image
 
