@@ -84,3 +84,5 @@ def setup(app: Any) -> None:
     """Make what is made from the code, and find all pages."""
     generate.write(HERE / "reference")
     app.connect("source-read", _fill_front_page)
+    # The front page changes with the list of pages, not with its own text.
+    app.connect("env-get-outdated", lambda *_: ["index"])
