@@ -79,7 +79,7 @@ name = "gcv"                        # or "fixed" with mu = "1e27 m^(4/3)", ...
 # name = "A"
 # wavelength = "0.88 um"
 # diameters = ["5 cm", "14.5 cm"]     # at the pupil's end and at the sources' end
-# series = {file = "las.csv"}         # Scintec .mnd, NetCDF, or CSV with units
+# series = {{file = "las.csv"}}         # Scintec .mnd, NetCDF, or CSV with units
 # [meteorology]
 # file = "weather.csv"
 # [terrain]
