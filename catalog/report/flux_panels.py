@@ -58,7 +58,8 @@ def draw_agreement(ax: Axes, pairs: Sequence[Pair]) -> Axes:
         few = np.isfinite(pair.ours).sum() <= 120
         good = np.isfinite(pair.ours)
         ax.errorbar(days[good], pair.ours[good], np.nan_to_num(pair.ours_error[good]), color=colour, lw=1.6,
-                    elinewidth=1, marker=marker if few else "", ms=5, label=f"{pair.name}, emulated")  # fmt: skip
+                    elinewidth=1, marker=marker if few else "", ms=5, label=f"{pair.name}, emulated",
+                    rasterized=not few)  # fmt: skip
         good = np.isfinite(pair.theirs)
         if good.any():
             few = good.sum() <= 120
@@ -86,7 +87,8 @@ def draw_scatter(ax: Axes, pairs: Sequence[Pair]) -> Axes:
         colour, marker = _COLOURS[index % len(_COLOURS)]
         x, y = pair.theirs[both], pair.ours[both]
         ax.errorbar(x, y, np.nan_to_num(pair.ours_error[both]), np.nan_to_num(pair.theirs_error[both]), color=colour,
-                    ls="", marker=marker, ms=5, elinewidth=0.8, label=pair.name)  # fmt: skip
+                    ls="", marker=marker, ms=5, elinewidth=0.8, label=pair.name,
+                    rasterized=both.sum() > 120)  # fmt: skip
         low, high = min(low, x.min(), y.min()), max(high, x.max(), y.max())
     if high > 0:
         ends = np.array([low / 1.4, high * 1.4])
