@@ -131,6 +131,8 @@ def connect(run: RunParameters) -> Iterator[Client]:
                 n_workers=1,
                 threads_per_worker=threads,
                 memory_limit=0,
+                # Nobody else's arrays are to be computed there once it is closed.
+                set_as_default=False,
                 # Nothing of ours listens beyond this machine, not even a page without figures.
                 dashboard_address="127.0.0.1:0",
                 worker_dashboard_address="127.0.0.1:0",

@@ -100,7 +100,12 @@ def shown(level: str | None, as_json: bool) -> Iterator[None]:
         One JSON object a line instead of text; level info where none is given.
     """
     if level is None and not as_json:
-        yield
+        # The progress tells what went wrong; Prefect's handlers of the root logger would tell it once more.
+        propagate, log.propagate = log.propagate, False
+        try:
+            yield
+        finally:
+            log.propagate = propagate
         return
     handler = logging.StreamHandler()
     handler.setFormatter(Json() if as_json else Text())

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["FLAGS", "Calibration", "SpotLayout", "extract", "response_to_tilt"]
 
 #: Changes whenever the numbers that this stage returns for the same input change.
-VERSION = 2
+VERSION = 3
 
 #: Part of its mean flux below which a spot is taken to be absent from a frame.
 FLUX_FLOOR = 0.02

@@ -180,6 +180,7 @@ class FakeClient:
     def __init__(self, changes: dict[str, dict[str, str]], *, present: bool = True) -> None:
         self.changes, self.present = changes, present
         self.scheduler = SimpleNamespace(address="tcp://10.0.0.1:8786")
+        self.cluster = None
 
     def wait_for_workers(self, count: int, timeout: float) -> None:
         if not self.present:
