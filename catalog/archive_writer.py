@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 from .archive import FRAME_DTYPES, MAX_FRAME, Faults, check_boxes, check_header, check_time
 from .archive_codecs import MAX_CHUNK_BYTES
 
+#: What recorders need; the rest is shared with ingest.
+__all__ = ["write_archive"]
+
 #: blosc compressor and level: lz4 is read fastest, zstd takes a quarter less room.
 _COMPRESSORS: dict[str, tuple[Literal["lz4", "zstd"], int]] = {"lz4": ("lz4", 5), "zstd": ("zstd", 1)}
 
@@ -124,7 +127,7 @@ def write_archive(
             made,
             attributes,
             time,
-            _chunked(first, blocks, len(time), chunk_frames),
+            cut(first, blocks, len(time), chunk_frames),
             first,
             planes,
             chunk_frames,
@@ -132,13 +135,14 @@ def write_archive(
         )
         if os.path.lexists(target) and not overwrite:
             raise FileExistsError(f"{target} was made by something else meanwhile; nothing was replaced")
-        _replace(made, target, work / "replaced")
+        replace(made, target, work / "replaced")
     finally:
         shutil.rmtree(work, ignore_errors=True)
     return target
 
 
-def _replace(made: Path, target: Path, aside: Path) -> None:
+def replace(made: Path, target: Path, aside: Path) -> None:
+    """Give `made` the name `target`; a folder that has it is moved to `aside`."""
     # A file replaces a file in one step; a folder that is not empty has to be moved out of the way.
     moved = os.path.lexists(target) and (target.is_dir() or made.is_dir())
     if moved:
@@ -151,7 +155,7 @@ def _replace(made: Path, target: Path, aside: Path) -> None:
         raise
 
 
-def _chunked(
+def cut(
     first: NDArray[Any], blocks: Iterator[NDArray[Any]], total: int, length: int
 ) -> Iterator[tuple[int, NDArray[Any]]]:
     """Cut blocks of any length into (first frame, chunk), holding at most one chunk and one block."""
@@ -181,6 +185,72 @@ def _chunked(
         yield seen - filled, buffer[:filled]
 
 
+def create_arrays(
+    store: Any,
+    attributes: Mapping[str, Any],
+    time: NDArray[np.int64],
+    shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    planes: Mapping[str, NDArray[Any]],
+    chunk_frames: int,
+    codec: str,
+) -> Any:
+    """Make an archive of what has been checked, all but the frames.
+
+    Parameters
+    ----------
+    store : zarr.abc.store.Store
+        Empty.
+    attributes : mapping
+        Attributes of the group.
+    time : ndarray of int64
+        (time,), ns.
+    shape : tuple of int
+        (rows, cols) of a frame.
+    dtype : numpy.dtype
+        Of the frames.
+    planes : mapping
+        dark, flat, bad_pixel, as far as they are given, in the types of the format.
+    chunk_frames : int
+        Frames in a chunk.
+    codec : {"lz4", "zstd"}
+        Compressor.
+
+    Returns
+    -------
+    zarr.Array
+        The frames, to be filled.
+    """
+    import zarr
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    name, level = _COMPRESSORS[codec]
+    arrays: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {"time": (time, ("time",))}
+    arrays |= {key: (plane, ("row", "col")) for key, plane in planes.items()}
+    group = zarr.create_group(store, attributes=dict(attributes))
+
+    def create(
+        key: str, shape: tuple[int, ...], chunks: tuple[int, ...], dtype: np.dtype[Any], axes: tuple[str, ...]
+    ) -> Any:
+        return group.create_array(
+            key,
+            shape=shape,
+            chunks=chunks,
+            dtype=dtype,
+            filters=(),
+            dimension_names=axes,
+            compressors=[
+                BloscCodec(cname=name, clevel=level, shuffle="shuffle", typesize=dtype.itemsize),
+                Crc32cCodec(),
+            ],
+            config={"write_empty_chunks": True},
+        )
+
+    for key, (values, axes) in arrays.items():
+        create(key, values.shape, tuple(min(n, _MAX_SIDE) for n in values.shape), values.dtype, axes)[...] = values
+    return create("frames", (len(time), *shape), (chunk_frames, *shape), dtype, ("time", "row", "col"))
+
+
 def _write(
     path: Path,
     attributes: dict[str, Any],
@@ -191,45 +261,11 @@ def _write(
     chunk_frames: int,
     codec: str,
 ) -> None:
-    import zarr
-    from zarr.codecs import BloscCodec, Crc32cCodec
     from zarr.storage import LocalStore, ZipStore
-
-    name, level = _COMPRESSORS[codec]
-
-    def compressors(dtype: np.dtype[Any]) -> list[Any]:
-        return [
-            BloscCodec(cname=name, clevel=level, shuffle="shuffle", typesize=dtype.itemsize),
-            Crc32cCodec(),
-        ]
 
     store = ZipStore(path, mode="w") if path.suffix == ".zip" else LocalStore(path)
     try:
-        group = zarr.create_group(store, attributes=attributes)
-        arrays: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {"time": (time, ("time",))}
-        arrays |= {key: (plane, ("row", "col")) for key, plane in planes.items()}
-        for key, (values, dimensions) in arrays.items():
-            array = group.create_array(
-                key,
-                shape=values.shape,
-                chunks=tuple(min(n, _MAX_SIDE) for n in values.shape),
-                dtype=values.dtype,
-                filters=(),
-                dimension_names=dimensions,
-                compressors=compressors(values.dtype),
-                config={"write_empty_chunks": True},
-            )
-            array[...] = values
-        stored = group.create_array(
-            "frames",
-            shape=(len(time), *sample.shape[1:]),
-            chunks=(chunk_frames, *sample.shape[1:]),
-            dtype=sample.dtype,
-            filters=(),
-            dimension_names=("time", "row", "col"),
-            compressors=compressors(sample.dtype),
-            config={"write_empty_chunks": True},
-        )
+        stored = create_arrays(store, attributes, time, sample.shape[1:], sample.dtype, planes, chunk_frames, codec)
         for first, chunk in chunks:
             stored[first : first + len(chunk)] = chunk
     finally:

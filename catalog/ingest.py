@@ -2,8 +2,8 @@
 
 Everything that can be known without the pixels is checked first, and every fault is told at once: the header file,
 each source file, their shapes and types, the time stamps, dark, flat and bad pixels. Then the frames are streamed.
-The archive appears at its place when it is whole; an ingest that was killed leaves nothing there and, run again,
-starts from the beginning (a conversion is limited by the disks and takes minutes, and half an archive is none).
+The archive appears at its place when it is whole. Until then it grows beside it (`ingest_resume`), and an ingest that
+was interrupted goes on there: chunks that are complete are neither read nor converted again.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ import json
 import math
 import os
 import re
-import shutil
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime
-from glob import escape, glob
+from glob import glob
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from zoneinfo import ZoneInfo
@@ -32,8 +32,9 @@ from ..pipeline.parameters import Parameters, TimeZone
 from ..pipeline.units import Duration, Frequency, QuantityError, faults, parse, safe, text
 from .archive import FRAME_DTYPES, MAX_FRAME, Archive, Faults, check_boxes, check_header, check_time, open_archive
 from .archive_codecs import MAX_CHUNK_BYTES
-from .archive_writer import write_archive
+from .archive_writer import create_arrays, cut, replace
 from .ingest_files import SUFFIXES, FileFault, FrameFile, Kind, Reading, open_file
+from .ingest_resume import Partial, differences, discard, partial_folder, read_journal
 
 #: Bytes of frames read at once.
 BLOCK_BYTES = 32 * 2**20
@@ -483,6 +484,8 @@ class Plan:
         dark, flat, bad_pixel, as far as they are given.
     fingerprint : str
         The same for the same sources and header.
+    inputs : list of [str, int, int]
+        Path, bytes and time of the last change (ns) of each source file.
     """
 
     attributes: dict[str, Any]
@@ -492,6 +495,7 @@ class Plan:
     dtype: np.dtype[Any] | None
     planes: dict[str, NDArray[Any]] = field(repr=False)
     fingerprint: str
+    inputs: list[list[Any]] = field(repr=False)
 
     @property
     def n_frames(self) -> int:
@@ -509,8 +513,13 @@ class Plan:
         """Type of the source files."""
         return self.files[0].dtype.newbyteorder("=")
 
-    def blocks(self, progress: Callable[[int], None] | None = None) -> Iterator[NDArray[Any]]:
+    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
         """Frames of the region in blocks, as they are stored.
+
+        Parameters
+        ----------
+        start, stop : int
+            First frame, and the one after the last; all of them by default. Files with none of them are not opened.
 
         Raises
         ------
@@ -518,14 +527,16 @@ class Plan:
             A file cannot be read.
         """
         stored = math.prod(self.files[0].frame_shape) * self.source_dtype.itemsize
-        done = 0
+        stop = self.n_frames if stop is None else stop
+        before = 0
         for file in self.files:
+            first, last = max(start - before, 0), min(stop - before, file.n_frames)
+            before += file.n_frames
+            if first >= last:
+                continue
             try:
-                for block in file.blocks(max(BLOCK_BYTES // stored, 1)):
+                for block in file.blocks(max(BLOCK_BYTES // stored, 1), start=first, stop=last):
                     yield block[:, self.region[0], self.region[1]]
-                    done += len(block)
-                    if progress is not None:
-                        progress(done)
             except (FileFault, OSError) as error:
                 raise IngestError([safe(f"{file.path}: {error}")]) from error
 
@@ -631,7 +642,8 @@ def plan_ingest(
     if fault.sentences or wrong:
         raise IngestError(_distinct([*fault.sentences, *wrong]))
     assert time is not None
-    fingerprint = _fingerprint(attributes, parameters, files, planes, time)
+    inputs = _inputs(files)
+    fingerprint = _fingerprint(attributes, parameters, inputs, planes, time)
     attributes["ingest"] = {
         "files": len(files),
         "first_file": files[0].path.name[:1000],
@@ -641,7 +653,7 @@ def plan_ingest(
         "source_dtype": source.name,
         "fingerprint": fingerprint,
     }
-    return Plan(attributes, tuple(files), time, region, dtype, planes, fingerprint)
+    return Plan(attributes, tuple(files), time, region, dtype, planes, fingerprint, inputs)
 
 
 def _distinct(sentences: list[str]) -> list[str]:
@@ -727,17 +739,25 @@ def _mean(file: FrameFile) -> NDArray[np.float64]:
     return total / file.n_frames
 
 
+def _inputs(files: Sequence[FrameFile]) -> list[list[Any]]:
+    found = []
+    for file in files:
+        known = file.path.stat()
+        found.append([str(file.path.absolute()), known.st_size, known.st_mtime_ns])
+    return found
+
+
 def _fingerprint(
     attributes: Mapping[str, Any],
     parameters: IngestParameters,
-    files: Sequence[FrameFile],
+    inputs: Sequence[Sequence[Any]],
     planes: Mapping[str, NDArray[Any]],
     time: NDArray[np.int64],
 ) -> str:
     digest = hashlib.sha256(json.dumps([attributes, parameters.model_dump(mode="json")], sort_keys=True).encode())
-    for file in files:
-        known = file.path.stat()
-        digest.update(f"{file.path.name}\0{known.st_size}\0{known.st_mtime_ns}\n".encode())
+    for path, size, modified in inputs:
+        # Where the files lie may differ: the same recording on another machine.
+        digest.update(f"{Path(path).name}\0{size}\0{modified}\n".encode())
     for name, plane in sorted(planes.items()):
         digest.update(name.encode() + np.ascontiguousarray(plane).tobytes())
     digest.update(time.astype("<i8").tobytes())
@@ -767,8 +787,11 @@ def survey(plan: Plan, progress: Progress | None = None) -> Survey:
         A file cannot be read, or no type of the format holds what is in them.
     """
     low, high, whole, single, not_finite, at_top = math.inf, -math.inf, True, True, 0, 0
-    tell = None if progress is None else lambda done: progress("reading", done, plan.n_frames)
-    for block in plan.blocks(tell):
+    done = 0
+    for block in plan.blocks():
+        done += len(block)
+        if progress is not None:
+            progress("reading", done, plan.n_frames)
         good = np.isfinite(block) if block.dtype.kind == "f" else None
         values = block if good is None else block[good]
         not_finite += block.size - values.size
@@ -822,24 +845,25 @@ def _exact(values: NDArray[Any], dtype: np.dtype[Any]) -> bool:
     return bool(np.all(same | ((values != values) & (there != there))))
 
 
-def _converted(plan: Plan, dtype: np.dtype[Any], progress: Progress | None) -> Iterator[NDArray[Any]]:
-    done = 0
-    for block in plan.blocks():
+class _InexactError(IngestError):
+    """The wanted type does not hold the pixels: nothing that was written is of use."""
+
+
+def _converted(plan: Plan, dtype: np.dtype[Any], start: int, stop: int) -> Iterator[NDArray[Any]]:
+    for block in plan.blocks(start, stop):
         if block.dtype != dtype:
             if not _exact(block, dtype):
                 finite = block[np.isfinite(block)] if block.dtype.kind == "f" else block
                 span = f"{finite.min():g} to {finite.max():g}" if finite.size else "nothing finite"
-                raise IngestError(
+                raise _InexactError(
                     [
-                        f"frames {done} to {done + len(block) - 1}: {block.dtype.name} values ({span}) are not all "
+                        f"frames {start} to {start + len(block) - 1}: {block.dtype.name} values ({span}) are not all "
                         f"exact in {dtype.name}; leave ingest.dtype out to have a type chosen"
                     ]
                 )
             block = block.astype(dtype)
         yield block
-        done += len(block)
-        if progress is not None:
-            progress("writing", done, plan.n_frames)
+        start += len(block)
 
 
 def chunk_frames(frame_shape: tuple[int, int], dtype: np.dtype[Any], wanted: int | None = None) -> int:
@@ -868,8 +892,9 @@ def ingest(
     chunk: int | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Archive:
-    """Write the archive.
+    """Write the archive, or what is missing of it since an interruption.
 
     Parameters
     ----------
@@ -885,6 +910,8 @@ def ingest(
         Replace what is there.
     progress : callable, optional
         Called with ("reading" or "writing", frames done, frames in all).
+    tell : callable, optional
+        Called with a sentence on what an interrupted ingest has left: whether it is continued, or why not.
 
     Returns
     -------
@@ -894,24 +921,108 @@ def ingest(
     Raises
     ------
     IngestError
-        There is something else at `output`, a file cannot be read, or a value has no exact place in the type.
+        There is something else at `output`, a file cannot be read or has changed meanwhile, or a value has no exact
+        place in the type.
+    OSError
+        The disk is full, or does not answer; what is complete is kept.
     """
-    if not overwrite and (made := made_before(plan, output)) is not None:
+    folder = partial_folder(output)
+    if not overwrite and not folder.exists() and (made := made_before(plan, output)) is not None:
         return made
     with _alone(output):
-        dtype = plan.dtype if plan.dtype is not None else np.dtype(survey(plan, progress).dtype)
-        length = chunk_frames(plan.frame_shape, dtype, chunk)
-        write_archive(
-            output,
-            plan.attributes,
-            plan.time,
-            _converted(plan, dtype, progress),
-            chunk_frames=length,
-            codec=codec,
-            overwrite=overwrite,
-            **plan.planes,
-        )
+        replaced = folder / "replaced"
+        if os.path.lexists(replaced) and not os.path.lexists(output):
+            os.rename(replaced, output)  # killed between the two steps of putting one folder in place of another
+        if overwrite or made_before(plan, output) is None:
+            try:
+                partial = _grown(plan, output, codec, chunk, progress, tell or (lambda sentence: None))
+            except _InexactError:
+                discard(folder)
+                raise
+            finished = partial.finished(output.suffix == ".zip")
+            if not overwrite:
+                made_before(plan, output)
+            replace(finished, output, replaced)
+        discard(folder)
     return open_archive(output)
+
+
+def _grown(
+    plan: Plan,
+    output: Path,
+    codec: Literal["lz4", "zstd"],
+    chunk: int | None,
+    progress: Progress | None,
+    tell: Callable[[str], None],
+) -> Partial:
+    """The whole archive, in the folder beside its place."""
+    import zarr
+    from zarr.storage import LocalStore
+
+    folder = partial_folder(output)
+    made_of: dict[str, Any] = {
+        "inputs": plan.inputs,
+        "fingerprint": plan.fingerprint,
+        "codec": codec,
+        # Other versions may write other bytes.
+        "versions": {name: version(name) for name in ("coslidar", "zarr", "numcodecs")},
+    }
+    before = read_journal(folder)
+    dtype = plan.dtype
+    if dtype is None and before is not None and not differences(before.made_of, made_of):
+        dtype = np.dtype(before.made_of["dtype"])  # that every frame was read for
+    elif dtype is None:
+        dtype = np.dtype(survey(plan, progress).dtype)
+    length = min(chunk_frames(plan.frame_shape, dtype, chunk), plan.n_frames)
+    made_of |= {"dtype": dtype.name, "chunk_frames": length}
+    n_chunks = -(-plan.n_frames // length)
+    partial = Partial(folder, made_of)
+
+    changed = [] if before is None else differences(before.made_of, made_of)
+    damaged = None if before is None or changed else partial.go_on(before)
+    if damaged is None:
+        if folder.exists():
+            why = "; ".join(changed) or "it had not come to the frames, or is damaged"
+            tell(safe(f"{output}: what an interrupted ingest has left is not used, all begins anew ({why})"))
+        partial.begin(
+            lambda path: create_arrays(
+                LocalStore(path), plan.attributes, plan.time, plan.frame_shape, dtype, plan.planes, length, codec
+            )
+        )
+    else:
+        again = f"; damaged and made again: {damaged}" if damaged else ""
+        tell(
+            safe(
+                f"{output}: goes on where an interrupted ingest stopped, with {len(partial.chunks)} of "
+                f"{n_chunks} chunks complete{again}"
+            )
+        )
+
+    # Chunks of nothing but zeros are written as well; an array that is opened has forgotten that.
+    with zarr.config.set({"array.write_empty_chunks": True}):
+        stored = zarr.open_array(LocalStore(partial.archive), path="frames", mode="r+")
+    runs = partial.missing(n_chunks)
+    done = plan.n_frames - sum(min(end * length, plan.n_frames) - first * length for first, end in runs)
+    if done and progress is not None:
+        progress("writing", done, plan.n_frames)
+    for first, end in runs:
+        start, stop = first * length, min(end * length, plan.n_frames)
+        blocks = _converted(plan, dtype, start, stop)
+        for offset, frames in cut(next(blocks), blocks, stop - start, length):
+            stored[start + offset : start + offset + len(frames)] = frames
+            partial.complete((start + offset) // length)
+            done += len(frames)
+            if progress is not None:
+                progress("writing", done, plan.n_frames)
+    try:
+        changed = differences(made_of, {"inputs": _inputs(plan.files), "fingerprint": plan.fingerprint})
+    except OSError as error:
+        changed = [str(error)]
+    if changed:
+        raise IngestError(
+            [safe(f"{name} while it was read; run the command again when it is complete") for name in changed]
+        )
+    return partial
 
 
 def made_before(plan: Plan, output: Path) -> Archive | None:
@@ -948,7 +1059,7 @@ def made_before(plan: Plan, output: Path) -> Archive | None:
 
 @contextmanager
 def _alone(output: Path) -> Iterator[None]:
-    """Keep other ingests of the same archive out, and remove what one that was killed has left."""
+    """Keep other ingests of the same archive out."""
     import fcntl
 
     output.parent.mkdir(parents=True, exist_ok=True)
@@ -959,10 +1070,10 @@ def _alone(output: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise IngestError([f"{safe(str(output))}: another ingest is writing this archive"]) from error
-        for left in output.parent.glob(f".{escape(output.name)}.*.tmp"):
-            shutil.rmtree(left, ignore_errors=True)
-        yield
-        lock.unlink(missing_ok=True)
+        try:
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
     finally:
         os.close(handle)
 

@@ -109,7 +109,7 @@ class FrameFile(ABC):
         """(rows, cols) of a frame."""
         return self.stored[self.axes.index("row")], self.stored[self.axes.index("col")]
 
-    def blocks(self, count: int, every: int = 1) -> Iterator[NDArray[Any]]:
+    def blocks(self, count: int, every: int = 1, *, start: int = 0, stop: int | None = None) -> Iterator[NDArray[Any]]:
         """Read the frames in blocks of about `count`, as (time, row, col) in the machine's byte order.
 
         Parameters
@@ -118,6 +118,8 @@ class FrameFile(ABC):
             Frames in a block; whole chunks where the file has such.
         every : int
             Read one of this many blocks only.
+        start, stop : int
+            First frame, and the frame after the last; all of them by default.
 
         Yields
         ------
@@ -131,23 +133,25 @@ class FrameFile(ABC):
         """
         time = self.axes.index("time") if "time" in self.axes else None
         count = max(count // self.step, 1) * self.step if self.step <= 4 * count else count
+        stop = self.n_frames if stop is None else stop
         seen = 0
-        for slab in self._slabs(time, count, every):
+        for slab in self._slabs(time, list(self._slices(time, count, every, start, stop))):
             block = slab[None] if time is None else slab
             axes = ("time", *self.axes) if time is None else self.axes
             block = block.transpose([axes.index(name) for name in ("time", "row", "col")])
             seen += len(block)
             yield block.astype(block.dtype.newbyteorder("="), copy=False)
-        if every == 1 and seen != self.n_frames:
-            raise FileFault(f"{seen} of {self.n_frames} frames could be read; the file has changed or is damaged")
+        if every == 1 and seen != stop - start:
+            raise FileFault(f"{seen} of {stop - start} frames could be read; the file has changed or is damaged")
 
-    def _slices(self, time: int | None, count: int, every: int) -> Iterator[tuple[slice, ...]]:
+    def _slices(self, time: int | None, count: int, every: int, first: int, stop: int) -> Iterator[tuple[slice, ...]]:
         whole = tuple(slice(0, n) for n in self.stored)
         if time is None:
             yield whole
             return
-        for start in range(0, self.stored[time], count * every):
-            part = slice(start, min(start + count, self.stored[time]))
+        # Blocks end where they would if all were read: chunks of the file are not unpacked twice.
+        for start in range(first // count * count, stop, count * every):
+            part = slice(max(start, first), min(start + count, stop))
             yield (*whole[:time], part, *whole[time + 1 :])
 
     @abstractmethod
@@ -155,8 +159,8 @@ class FrameFile(ABC):
         """Shape and type as stored, and how many frames are best read together."""
 
     @abstractmethod
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
-        """Parts of the data along axis `time`, as stored."""
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
+        """The parts of the data, cut along axis `time`, as stored."""
 
     def keyword(self, name: str) -> Any:
         """A value of the file's own header."""
@@ -294,15 +298,15 @@ class FitsFile(FrameFile):
             one = unit.section[tuple(slice(0, 1) for _ in unit.shape)]
             return tuple(unit.shape), one.dtype, 1
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
         # What is open is closed before a block is handed on: the reader's warning filters must not reach its user.
         if self.path.suffix == ".gz":
             with self._open() as units:
                 whole = np.asarray(self._unit(units).section[...])
-            for part in self._slices(time, count, every):
+            for part in parts:
                 yield whole[part]
             return
-        for part in self._slices(time, count, every):
+        for part in parts:
             with self._open() as units:
                 block = np.asarray(self._unit(units).section[part])
             yield block
@@ -370,8 +374,8 @@ class Hdf5File(FrameFile):
             step = data.chunks[time] if data.chunks and time is not None else 1
             return tuple(data.shape), data.dtype, int(step)
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
-        for part in self._slices(time, count, every):
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
+        for part in parts:
             with self._open() as file:
                 block = self._dataset(file)[part]
             yield block
@@ -459,9 +463,9 @@ class NumpyFile(FrameFile):
             )
         return shape, dtype, 1
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
         if not self._packed:
-            for part in self._slices(time, count, every):
+            for part in parts:
                 # Mapped anew each time, so that pages that were read do not count as this program's memory.
                 with _quiet():
                     block = np.array(np.load(self.path, mmap_mode="r", allow_pickle=False)[part])
@@ -472,7 +476,7 @@ class NumpyFile(FrameFile):
             with archive.open(f"{name}.npy") as stream:
                 shape, _, dtype, _ = self._head(archive, name, stream)
                 start = stream.tell()
-                for part in self._slices(time, count, every):
+                for part in parts:
                     sides = tuple(piece.stop - piece.start for piece in part)
                     size = math.prod(sides) * dtype.itemsize
                     with _quiet():
@@ -562,8 +566,8 @@ class TiffFile(FrameFile):
                 raise FileFault("the pages of a TIFF are its frames: the first of ingest.axes must be 'time'")
             return shape, dtype, 1
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
-        for part in self._slices(time, count, every):
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
+        for part in parts:
             with self._open() as file:
                 shape, dtype, offset = self._series(file)
                 if offset is not None:
@@ -634,9 +638,9 @@ class MatlabFile(FrameFile):
             raise FileFault("it is too large to be read at once; save it with save(..., '-v7.3') or as raw binary")
         return shape, dtype, 1
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
         data = self._load(self._name()[0])
-        for part in self._slices(time, count, every):
+        for part in parts:
             yield data[part]
 
     def array(self, name: str) -> NDArray[Any]:
@@ -676,12 +680,12 @@ class RawFile(FrameFile):
             )
         return (int(count), *reading.shape), dtype, 1
 
-    def _slabs(self, time: int | None, count: int, every: int) -> Iterator[NDArray[Any]]:
+    def _slabs(self, time: int | None, parts: list[tuple[slice, ...]]) -> Iterator[NDArray[Any]]:
         reading = self.reading
         frame = math.prod(self.stored[1:]) * self.dtype.itemsize
         pitch = frame + reading.gap
         inner = np.zeros(self.stored[1:], self.dtype).strides
-        for part in self._slices(time, count, every):
+        for part in parts:
             length = part[0].stop - part[0].start
             with _quiet(), self.path.open("rb") as file:
                 file.seek(reading.offset + part[0].start * pitch)

@@ -64,7 +64,9 @@ def ingest(
     """Make a raw archive of FITS, HDF5, NumPy, TIFF, MATLAB or raw binary files.
 
     SOURCE is one file or several in the order of time; a pattern in quotes is put in natural order. All frames go
-    into one archive, which is at its place when it is whole: after an interruption, run the same command again.
+    into one archive, which is at its place when it is whole. After an interruption, run the same command again: it goes
+    on with the chunks that are complete, kept in the hidden folder .OUT.zarr.partial beside the output; where files or
+    options have changed since, it says so and begins anew.
     """
     from ...catalog.ingest import describe, find_sources, made_before, plan_ingest, survey
     from ...catalog.ingest import ingest as write
@@ -91,8 +93,11 @@ def ingest(
     from ...catalog.archive import describe as describe_archive
     from ...catalog.archive import notes
 
+    def tell(sentence: str) -> None:
+        click.echo(f"coslidar: {sentence}", err=True)
+
     with _progress() as progress:
-        made = write(plan, output, codec=codec, chunk=chunk_frames, overwrite=force, progress=progress)
+        made = write(plan, output, codec=codec, chunk=chunk_frames, overwrite=force, progress=progress, tell=tell)
     told = {key: value for key, value in describe_archive(made).items() if key not in ("attributes", "notes", "mask")}
     _show(told, notes(made), as_json)
 

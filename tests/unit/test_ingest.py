@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -140,6 +139,15 @@ def test_round_trip(tmp_path: Path, frames: NDArray[Any], name: str, monkeypatch
     np.testing.assert_array_equal(archive.read_chunk(0), frames)
     np.testing.assert_array_equal(archive.time, small_time(N))
     assert archive.attributes["ingest"]["first_file"] == name
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_part_of_the_frames(tmp_path: Path, frames: NDArray[Any], name: str) -> None:
+    """As an ingest that goes on reads them; blocks end where they do without `start`, at chunks of the file."""
+    WRITERS[name](tmp_path / name, frames)
+    blocks = list(open_file(tmp_path / name, Reading()).blocks(7, start=5, stop=17))
+    assert [len(block) for block in blocks] == [2, 7, 3]
+    np.testing.assert_array_equal(np.concatenate(blocks), frames[5:17])
 
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int16", "float32"])
@@ -607,32 +615,6 @@ def test_the_same_command_again_keeps_what_is_done(tmp_path: Path, frames: NDArr
     assert "is there already and is not of these sources" in str(done.exception)
     assert run(*command, "--force").exit_code == 0
     np.testing.assert_array_equal(open_archive(tmp_path / "o.zarr.zip").read_chunk(0), frames + 1)
-
-
-_KILLED = """
-import os, signal, sys
-from pathlib import Path
-from coslidar.catalog import ingest as module
-module.BLOCK_BYTES = 6000
-folder = Path(sys.argv[1])
-plan = module.plan_ingest([folder / "a.npy"], folder / "header.json")
-def stop(what, done, total):
-    if done > total // 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-module.ingest(plan, folder / "o.zarr.zip", chunk=4, progress=stop)
-"""
-
-
-def test_an_ingest_that_was_killed_starts_again_cleanly(tmp_path: Path, frames: NDArray[Any]) -> None:
-    np.save(tmp_path / "a.npy", frames)
-    header = write_header(tmp_path)
-    done = subprocess.run([sys.executable, "-c", _KILLED, str(tmp_path)], check=False)
-    assert done.returncode == -signal.SIGKILL
-    assert not (tmp_path / "o.zarr.zip").exists()
-    assert list(tmp_path.glob(".o.zarr.zip.*.tmp"))  # or this test would show nothing
-    assert run(tmp_path / "a.npy", "--header", header, "-o", tmp_path / "o.zarr.zip").exit_code == 0
-    assert sorted(os.listdir(tmp_path)) == ["a.npy", "header.json", "o.zarr.zip"]
-    np.testing.assert_array_equal(open_archive(tmp_path / "o.zarr.zip").read_chunk(0), frames)
 
 
 def test_two_ingests_of_one_archive_keep_out_of_each_others_way(tmp_path: Path, frames: NDArray[Any]) -> None:
