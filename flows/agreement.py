@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from ..pipeline.comparison import Pair, emulate, on_windows
+from ..pipeline.beam_heights import SightHeights, beam_heights, mean_separation, scaled_weights
+from ..pipeline.comparison import Pair, Separation, emulate, on_windows
 from ..pipeline.geometry import SliceGrid
 from ..pipeline.parameters import Scintillometer
 from ..pipeline.scintillometer import saturation_limit, slice_weights
@@ -88,30 +89,56 @@ class _Batches:
     bounds: NDArray[np.int64]
     values: Array
     errors: Array
+    separation: Separation
+
+
+def path_of(dataset: Any) -> tuple[float, SliceGrid]:
+    """Path length, m, and slices of a product."""
+    edges = dataset["z_bounds"].values
+    try:
+        length = parse(dataset.attrs.get("path_length"), "m", allow_infinite=True)
+    except QuantityError:
+        length = float(edges[-1, 1])
+    return length, SliceGrid((*map(float, edges[:, 0]), float(edges[-1, 1])))
+
+
+def covariance_of(dataset: Any) -> Array:
+    """Covariances of the posterior of each batch, m^(-4/3); NaN in products of older versions, which hold none."""
+    if "cn2_posterior_covariance" in dataset:
+        return np.asarray(dataset["cn2_posterior_covariance"].values, dtype=np.float64)
+    return np.full((*dataset["cn2"].shape, dataset["cn2"].shape[1]), np.nan)
+
+
+def _sight(dataset: Any) -> SightHeights | None:
+    """Heights of the line of sight that a product holds."""
+    if "flux_height" not in dataset:  # no heights in its header, or an older product
+        return None
+    borders = np.asarray(dataset["border_height"].values, dtype=np.float64)
+    return SightHeights(
+        np.asarray(dataset["flux_height"].values, dtype=np.float64), np.append(borders[:, 0], borders[-1, 1])
+    )
 
 
 def _emulated(datasets: Sequence[Any], one: Scintillometer) -> _Batches:
     parts: list[tuple[NDArray[np.int64], Array, Array]] = []
+    vertical = []
     for dataset in datasets:
+        length, grid = path_of(dataset)
         try:
-            length = parse(dataset.attrs.get("path_length"), "m", allow_infinite=True)
-        except QuantityError:
-            length = float(dataset["z_bounds"].values[-1, 1])
-        grid = SliceGrid((*map(float, dataset["z_bounds"].values[:, 0]), float(dataset["z_bounds"].values[-1, 1])))
-        try:
-            weights = slice_weights(grid, one.ends(length), *one.diameters, one.wavelength)
+            shares = slice_weights(grid, one.ends(length), *one.diameters, one.wavelength)
+            sight = _sight(dataset)
+            weights = scaled_weights(one, length, grid, shares, sight)
         except ValueError as error:
             raise InputError([f"scintillometer {one.name}: {error}"]) from error
+        if sight is not None:
+            vertical.append(mean_separation(beam_heights(one, length, grid, sight), sight.effective, shares))
         cn2 = np.asarray(dataset["cn2"].values, dtype=np.float64)
-        if "cn2_posterior_covariance" in dataset:
-            covariance = np.asarray(dataset["cn2_posterior_covariance"].values, dtype=np.float64)
-        else:  # products of older versions hold no covariance
-            covariance = np.full((*cn2.shape, cn2.shape[1]), np.nan)
         bounds = dataset["time_bounds"].values.astype("datetime64[ns]").astype(np.int64)
-        parts.append((bounds, *emulate(cn2, covariance, weights)))
+        parts.append((bounds, *emulate(cn2, covariance_of(dataset), weights)))
     bounds, values, errors = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(bounds[:, 0], kind="stable")
-    return _Batches(bounds[order], values[order], errors[order])
+    apart = Separation(one.offset, vertical[0] if vertical else float("nan"), one.height_scaling != "none")
+    return _Batches(bounds[order], values[order], errors[order], apart)
 
 
 def pairs_of(
@@ -160,7 +187,7 @@ def pairs_of(
             own = station.series.mean_over(windows, "cn2_error", coverage)
             theirs = measured.mean
             theirs_error = np.where(np.isfinite(measured.error), measured.error, own.mean)
-        found.append(Pair(station.instrument.name, windows, ours, ours_error, theirs, theirs_error))
+        found.append(Pair(station.instrument.name, windows, ours, ours_error, theirs, theirs_error, batches.separation))
     return found
 
 

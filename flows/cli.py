@@ -26,6 +26,7 @@ COMMANDS = {
     "status": ("status", "Show how far runs are, what failed in them, and how to continue."),
     "show": ("reproduce", "Print a product's lineage as the campaign file that makes it again."),
     "compare": ("agreement", "Compare profiles with scintillometers on the same path."),
+    "link": ("link", "Tell what profiles mean for an optical link: r0, isoplanatic angle, coherence time, Rytov."),
     "report": ("report", "Draw one self-contained page of a campaign or product."),
     "export": ("export", "Write products as CSV, NetCDF or Parquet, slopes and fluxes as AOT telemetry."),
     "browse": ("browse", "Look through a catalog in a web browser."),

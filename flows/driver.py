@@ -262,6 +262,7 @@ def model_of(plan: ArchivePlan, work: Work) -> stages.Model:
         scintillometers=description.scintillometer_weights(
             plan.header, plan.grid, work.settings.configuration.response.sampling
         ),
+        height_factors=description.scintillometer_factors(plan.header, plan.grid),
         strong=strong_scintillation.from_responses(
             responses, plan.geometry, plan.grid, work.settings.configuration.response.sampling
         ),

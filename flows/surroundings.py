@@ -11,10 +11,11 @@ import numpy as np
 
 from ..catalog.elevation import read_transect
 from ..catalog.series import Reading, SeriesError, read_series
+from ..pipeline.beam_heights import scaled_weights, sight_heights
 from ..pipeline.optical_parameters import fried_weights
 from ..pipeline.scintillometer import slice_weights
 from ..pipeline.surroundings import Instrument, Surroundings
-from ..pipeline.terrain import Beam, Transect, beam_above_ground, heights, slice_heights
+from ..pipeline.terrain import Beam, Transect, beam_above_ground, heights
 from ..pipeline.units import safe
 from .settings import InputError
 
@@ -158,7 +159,8 @@ def surroundings_of(header: Header, grid: SliceGrid, settings: Settings, start: 
                 found[key] = series_of(given, settings.folder, key, settings.origin).within(start, stop)
             except InputError as error:
                 faults += error.faults
-    high = slice_heights_of(header, grid)
+    sight = sight_heights(header.path, grid)
+    high = None if sight is None else sight.effective
     if weather is not None and high is None:
         faults.append(
             f"{settings.origin}: meteorology: heat fluxes need the height above ground; give path.height, "
@@ -177,7 +179,8 @@ def surroundings_of(header: Header, grid: SliceGrid, settings: Settings, start: 
     instruments = []
     for number, one in enumerate(header.scintillometers):
         try:
-            slice_weights(grid, one.ends(length), *one.diameters, one.wavelength)
+            weights = slice_weights(grid, one.ends(length), *one.diameters, one.wavelength)
+            scaled_weights(one, length, grid, weights, sight)
         except ValueError as error:
             faults.append(f"{settings.origin}: scintillometers[{number}]: {error}")
     if faults:
@@ -194,15 +197,3 @@ def surroundings_of(header: Header, grid: SliceGrid, settings: Settings, start: 
         instruments=tuple(instruments),
         model_weights=fried_weights(grid, length),
     )
-
-
-def slice_heights_of(header: Header, grid: SliceGrid) -> np.ndarray[tuple[int], np.dtype[np.float64]] | None:
-    """Height of each slice whose free convection is the mean of it: the mean of h^(-4/3), to the power -3/4; m."""
-    if header.path.heights is not None:
-        z, above = np.array(header.path.heights).T
-        # Heights as they are: the ground lies that much below a straight line at zero.
-        level = Beam(float(z[-1]), 0.0, 0.0, refraction=1.0)
-        return slice_heights(Transect(z, -above), level, grid, exponent=-4 / 3)
-    if header.path.height is not None and header.path.height > 0:
-        return np.full(grid.k, header.path.height)
-    return None

@@ -28,6 +28,7 @@ from . import (
     uncertainty,
     vibration,
 )
+from .beam_heights import carried_weights
 from .geometry import MAP_KINDS
 from .parameters import SOURCES_USED
 from .products import INTENSITY_KINDS, MU_FACTORS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
@@ -105,6 +106,8 @@ class Model:
         Data used, unpenalised unknowns, estimator.
     scintillometers : ndarray, (n, k)
         Weight of each slice in the Cn2 of each scintillometer on the path; n = 0 without any.
+    height_factors : ndarray, (n, k), optional
+        Factor that carries Cn2 of each slice to the height of each scintillometer; 1 where it is absent.
     strong : StrongScintillation, optional
         Correction of the scintillation response; first order where it is absent.
     surroundings : Surroundings, optional
@@ -119,6 +122,7 @@ class Model:
     selector: HyperparameterSelector
     inversion: InversionParameters
     scintillometers: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 0)))
+    height_factors: NDArray[np.float64] | None = None
     strong: strong_scintillation.StrongScintillation | None = None
     surroundings: Surroundings | None = None
 
@@ -463,10 +467,6 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "valid_fraction": arrays["valid_fraction"],
         "chi2_reduced": profile.chi2_reduced,
     }
-    if len(model.scintillometers):
-        averages = [partial(turbulence.path_average, weights=weights) for weights in model.scintillometers]
-        values["cn2_path_average"] = np.array([average(profile.cn2) for average in averages])
-        values["cn2_path_average_interval_68"] = np.stack([interval(average) for average in averages])
     draws = None if profile.posterior is None else profile.posterior.draws
     # Who compares the product with an instrument that was not known here carries the errors with this.
     values["cn2_posterior_covariance"] = (
@@ -474,6 +474,10 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
     )
     if len(model.scintillometers):
         shares = model.scintillometers / model.scintillometers.sum(axis=1, keepdims=True)
+        if model.height_factors is not None:
+            shares = carried_weights(shares, model.height_factors)
+        values["cn2_path_average"] = shares @ profile.cn2
+        values["cn2_path_average_interval_68"] = np.stack([interval(partial(np.inner, row)) for row in shares])
         values["cn2_path_average_standard_error"] = np.sqrt(
             np.einsum("ik,kl,il->i", shares, values["cn2_posterior_covariance"], shares)
         )

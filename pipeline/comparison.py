@@ -163,6 +163,36 @@ def compare(ours: Array, ours_error: Array, theirs: Array, theirs_error: Array) 
     )
 
 
+@dataclass(frozen=True)
+class Separation:
+    """How far the paths of two instruments are apart.
+
+    Parameters
+    ----------
+    lateral : float
+        Lateral distance, m, positive to the right of who looks from the pupil to the sources.
+    vertical : float
+        Mean height of the other above ours, as it weights the path, m; NaN if unknown.
+    carried : bool
+        Whether ours was carried to the height of the other.
+    """
+
+    lateral: float = 0.0
+    vertical: float = float("nan")
+    carried: bool = False
+
+    def text(self) -> str:
+        """In words; `-` where the other is on our path, as far as is known."""
+        parts = []
+        if self.lateral:
+            parts.append(f"{abs(self.lateral):.4g} m {'right' if self.lateral > 0 else 'left'}")
+        if np.isfinite(self.vertical):
+            parts.append(f"{abs(self.vertical):.1f} m {'below' if self.vertical < 0 else 'above'}")
+        if self.carried:
+            parts.append("carried as h^(-4/3)")
+        return ", ".join(parts) or "-"
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """Two series of Cn2 on one time base.
@@ -175,6 +205,8 @@ class Pair:
         Windows, ns since 1970 UTC.
     ours, ours_error, theirs, theirs_error : ndarray of float, (n,)
         Cn2 of profiles as the instrument weights it, its own, and standard errors, m^(-2/3).
+    separation : Separation
+        Of the instrument from the line of sight.
     """
 
     name: str
@@ -183,6 +215,7 @@ class Pair:
     ours_error: Array
     theirs: Array
     theirs_error: Array
+    separation: Separation = Separation()
 
     def comparison(self) -> Comparison:
         """How they compare."""
@@ -199,7 +232,7 @@ def emulate(cn2: Array, covariance: Array, weights: Array) -> tuple[Array, Array
     covariance : ndarray of float, (n, k, k)
         Covariances of their posterior, m^(-4/3).
     weights : ndarray of float, (k,)
-        Weights of the slices, summing to 1.
+        Weights of the slices.
 
     Returns
     -------

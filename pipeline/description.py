@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import turbulence, vibration
+from .beam_heights import beam_heights, height_factors, sight_heights
 from .geometry import MAP_KINDS
 from .products import INTENSITY_KINDS, SLOPE_KINDS
 from .scintillometer import slice_weights
@@ -26,8 +27,16 @@ def tracked(header: Header) -> dict[str, Any]:
     """What of a header enters a product beside geometry and detector."""
     return {
         "heights": header.path.heights,
+        **({} if header.path.heights is not None or header.path.height is None else {"height": header.path.height}),
         "scintillometers": [
-            (s.name, s.wavelength, s.diameters, *s.ends(header.path.length)) for s in header.scintillometers
+            (
+                s.name,
+                s.wavelength,
+                s.diameters,
+                *s.ends(header.path.length),
+                *(s.offset, s.heights, s.height_scaling),
+            )
+            for s in header.scintillometers
         ],
     }
 
@@ -42,6 +51,16 @@ def scintillometer_weights(header: Header, grid: SliceGrid, sampling: turbulence
             for other in header.scintillometers
         ]
     )
+
+
+def scintillometer_factors(header: Header, grid: SliceGrid) -> Array:
+    """Factor of Cn2 from the height of each slice to that of each scintillometer's beam, (n, k); 1 if not asked for."""
+    sight = sight_heights(header.path, grid)
+    factors = np.ones((len(header.scintillometers), grid.k))
+    for row, one in zip(factors, header.scintillometers, strict=True):
+        if one.height_scaling != "none" and sight is not None:
+            row[:] = height_factors(beam_heights(one, header.path.length, grid, sight), sight.effective)
+    return factors
 
 
 def fresnel_scale(geometry: Geometry, z: Array) -> Array:
@@ -89,10 +108,22 @@ def describe(model: Model, header: Header) -> dict[str, NDArray[Any]]:
         at, height = np.array(header.path.heights).T
         inside = (grid.centres >= at[0]) & (grid.centres <= at[-1])
         found["height_above_ground"] = np.where(inside, np.interp(grid.centres, at, height), np.nan)
+    sight = sight_heights(header.path, grid)
+    if sight is not None:
+        found["flux_height"] = sight.effective
+        found["border_height"] = np.stack([sight.borders[:-1], sight.borders[1:]], axis=1)
     if header.scintillometers:
+        beams = np.stack([beam_heights(one, header.path.length, grid, sight) for one in header.scintillometers])
+        found["scintillometer_offset"] = np.array([one.offset for one in header.scintillometers])
+        found["scintillometer_height"] = beams
+        found["scintillometer_height_factor"] = scintillometer_factors(header, grid)
         found["scintillometer_weight"] = model.scintillometers
-        if model.surroundings is not None and (heights := model.surroundings.heights) is not None:
+        if sight is not None:
             found["effective_height"] = np.array(
-                [effective_height(heights, weights) for weights in model.scintillometers]
+                [
+                    # An instrument of unknown height is taken as on the line of sight.
+                    effective_height(sight.effective if one.heights is None else beam, weights)
+                    for one, beam, weights in zip(header.scintillometers, beams, model.scintillometers, strict=True)
+                ]
             )
     return found

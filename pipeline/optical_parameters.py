@@ -88,6 +88,43 @@ def fried_weights(grid: SliceGrid, path_length: float) -> Array:
     return _moment(np.asarray(grid.edges), path_length, 0, 5 / 3)
 
 
+#: Parameter -> power of the integral of Cn2 that it is.
+_POWERS = {
+    "fried_parameter": -3 / 5,
+    "isoplanatic_angle": -3 / 5,
+    "coherence_time": -3 / 5,
+    "rytov_variance": 1.0,
+}
+
+
+def _weights(
+    grid: SliceGrid,
+    wavelength: float,
+    path_length: float,
+    wave: Wave,
+    direction: Direction,
+    wind: ArrayLike | None,
+) -> dict[str, Array]:
+    """Weights (..., k) of the slices in the integral behind each parameter of :func:`optical_parameters`."""
+    if not (0 < wavelength < np.inf and 0 < path_length < np.inf):
+        raise ValueError("wavelength and path length must be positive and finite")
+    edges = np.minimum(np.asarray(grid.edges), path_length)
+    order = slice(None)
+    if direction == "toward_sources":
+        edges = (path_length - edges)[::-1]
+        order = slice(None, None, -1)
+    spherical = wave == "spherical"
+    k = 2 * np.pi / wavelength
+    speed = np.full(grid.k, np.nan) if wind is None else np.asarray(wind, dtype=np.float64)[..., order]
+    found = {
+        "fried_parameter": PHASE / AT_R0 * k**2 * _moment(edges, path_length, 0, 5 / 3 * spherical),
+        "isoplanatic_angle": PHASE * k**2 * _moment(edges, path_length, 5 / 3, 0),
+        "coherence_time": PHASE * k**2 * speed ** (5 / 3) * np.diff(edges),
+        "rytov_variance": INDEX * k ** (7 / 6) * _moment(edges, path_length, 5 / 6, 5 / 6 * spherical),
+    }
+    return {name: weights[..., order] for name, weights in found.items()}
+
+
 def optical_parameters(
     cn2: ArrayLike,
     grid: SliceGrid,
@@ -137,24 +174,57 @@ def optical_parameters(
     ValueError
         Wavelength or length is not positive and finite.
     """
-    if not (0 < wavelength < np.inf and 0 < path_length < np.inf):
-        raise ValueError("wavelength and path length must be positive and finite")
     profile = np.asarray(cn2, dtype=np.float64)
-    edges = np.minimum(np.asarray(grid.edges), path_length)
-    if direction == "toward_sources":
-        edges = (path_length - edges)[::-1]
-        profile = profile[..., ::-1]
-        wind = None if wind is None else np.asarray(wind)[..., ::-1]
-    spherical = wave == "spherical"
-    k = 2 * np.pi / wavelength
+    weights = _weights(grid, wavelength, path_length, wave, direction, wind)
     with np.errstate(divide="ignore"):
-        r0 = (PHASE / AT_R0 * k**2 * (profile @ _moment(edges, path_length, 0, 5 / 3 * spherical))) ** (-3 / 5)
-        angle = (PHASE * k**2 * (profile @ _moment(edges, path_length, 5 / 3, 0))) ** (-3 / 5)
-        time = np.full(np.shape(r0), np.nan)
-        if wind is not None:
-            moved = np.sum(profile * np.asarray(wind, dtype=np.float64) ** (5 / 3) * np.diff(edges), axis=-1)
-            time = (PHASE * k**2 * moved) ** (-3 / 5)
-    index = INDEX * k ** (7 / 6) * (profile @ _moment(edges, path_length, 5 / 6, 5 / 6 * spherical))
-    return OpticalParameters(
-        np.asarray(r0), np.asarray(angle), np.asarray(time), np.asarray(index), np.asarray(index < 0.3)
-    )
+        found = {name: np.sum(profile * weights[name], axis=-1) ** power for name, power in _POWERS.items()}
+    return OpticalParameters(**found, weak=np.asarray(found["rytov_variance"] < 0.3))
+
+
+def optical_intervals(
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    grid: SliceGrid,
+    wavelength: float,
+    path_length: float,
+    *,
+    wave: Wave = "spherical",
+    direction: Direction = "toward_pupil",
+    wind: ArrayLike | None = None,
+) -> dict[str, Array]:
+    """Intervals of 68 % of the parameters of :func:`optical_parameters`, from mean and covariance of a posterior.
+
+    Each parameter is a power of one integral over Cn2, which is positive and has a mean and a variance; it is taken as
+    log-normal with both, so that the interval of any power of it is the power of its ends.
+
+    Parameters
+    ----------
+    mean : array_like, (..., k)
+        Means of the posterior of the profiles, m^(-2/3).
+    covariance : array_like, (..., k, k)
+        Its covariances, m^(-4/3).
+    grid, wavelength, path_length, wave, direction, wind
+        As for :func:`optical_parameters`.
+
+    Returns
+    -------
+    dict of str to ndarray, (..., 2)
+        Lower and upper end, by the name of the parameter; NaN where mean or covariance is, or no wind is given.
+
+    Raises
+    ------
+    ValueError
+        Wavelength or length is not positive and finite.
+    """
+    profile, spread = np.asarray(mean, dtype=np.float64), np.asarray(covariance, dtype=np.float64)
+    found = {}
+    for name, weights in _weights(grid, wavelength, path_length, wave, direction, wind).items():
+        integral = np.sum(profile * weights, axis=-1)
+        variance = np.maximum(np.einsum("...k,...kl,...l->...", weights, spread, weights), 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_variance = np.log1p(variance / integral**2)
+            middle = np.log(integral) - log_variance / 2
+        deviation = np.sqrt(log_variance)
+        ends = np.exp(_POWERS[name] * np.stack([middle - deviation, middle + deviation], axis=-1))
+        found[name] = np.sort(ends, axis=-1)
+    return found

@@ -441,10 +441,24 @@ class Scintillometer(HeaderPart):
     """Distance of the aperture at the pupil's end from the pupil."""
     end: Length | None = None
     """Distance of the aperture at the sources' end from the pupil; that of the sources where it is absent."""
+    offset: Length = "0 m"  # type: ignore[assignment]
+    """Lateral distance of its path from the line of sight, positive to the right of who looks from the pupil to the
+    sources. It is told beside the comparison and changes no number: turbulence counts as uniform across the path."""
+    heights: tuple[Annotated[Length, Field(gt=0)], Annotated[Length, Field(gt=0)]] | None = None
+    """Of its beam above the ground, at the pupil's end and at the sources' end."""
+    height_scaling: Literal["none", "free_convection"] = "none"
+    """Whether each slice of a profile is carried from the height of the line of sight to that of the beam, as
+    h^(-4/3)."""
     transmitter: Literal["pupil", "sources"] = "sources"
     """End at which it emits; it does not matter to the weighting, and names the diameter that alpha belongs to."""
     series: SeriesFile | None = None
     """What it measured."""
+
+    @model_validator(mode="after")
+    def _heights_to_scale_to(self) -> Scintillometer:
+        if self.height_scaling != "none" and self.heights is None:
+            raise ValueError("height_scaling needs heights, of the beam above the ground at both of its ends")
+        return self
 
     def ends(self, path_length: float) -> tuple[float, float]:
         """Distances of both apertures from the pupil, m."""

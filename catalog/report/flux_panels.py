@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...pipeline.comparison import Pair
+from ...pipeline.beam_heights import mean_separation
+from ...pipeline.comparison import Pair, Separation
 from .reading import DAY, Floats, bounds, edges, listed, values
 from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, figure_style
 from .time_panels import _frame, _join, _visible, time_axis
@@ -25,6 +26,7 @@ _COLOURS = ((PURPLE, "o"), (GREEN, "s"), (BLUE, "D"), (RED, "^"))
 def pairs_in(datasets: Sequence[Dataset]) -> list[Pair]:
     """Emulated and measured path averages of each scintillometer that the products name."""
     found: dict[str, list[tuple[Any, ...]]] = {}
+    apart: dict[str, Separation] = {}
     for dataset in datasets:
         if "cn2_path_average" not in dataset or "scintillometer" not in dataset.coords:
             continue
@@ -39,15 +41,31 @@ def pairs_in(datasets: Sequence[Dataset]) -> list[Pair]:
         ]
         blank = np.full(dataset["cn2_path_average"].shape, np.nan)
         for index, name in enumerate(dataset["scintillometer"].values):
-            found.setdefault(clean(name)[:24].replace("$", r"\$"), []).append(
+            shown = clean(name)[:24].replace("$", r"\$")
+            apart.setdefault(shown, _separation(dataset, index))
+            found.setdefault(shown, []).append(
                 (bounds(dataset), *((blank if column is None else column)[:, index] for column in columns))
             )
     pairs = []
     for name, parts in found.items():
         whole = [np.concatenate(column) for column in zip(*parts, strict=True)]
         order = np.argsort(whole[0][:, 0], kind="stable")
-        pairs.append(Pair(name, *(column[order] for column in whole)))
+        when, ours, ours_error, theirs, theirs_error = (column[order] for column in whole)
+        pairs.append(Pair(name, when, ours, ours_error, theirs, theirs_error, apart[name]))
     return pairs
+
+
+def _separation(dataset: Dataset, index: int) -> Separation:
+    """How far a scintillometer of a product is from the line of sight; products of older versions do not say."""
+    names = (
+        "scintillometer_offset", "scintillometer_height", "scintillometer_weight", "scintillometer_height_factor",
+    )  # fmt: skip
+    if not all(name in dataset for name in names):
+        return Separation()
+    offset, height, weight, factor = (np.asarray(dataset[name].values[index], np.float64) for name in names)
+    sight = values(dataset, "flux_height")
+    vertical = float("nan") if sight is None else mean_separation(height, sight.ravel(), weight)
+    return Separation(float(offset), vertical, bool((factor != 1).any()))
 
 
 def draw_agreement(ax: Axes, pairs: Sequence[Pair]) -> Axes:
@@ -158,8 +176,10 @@ def describe_agreement(datasets: Sequence[Dataset]) -> str:
     parts = []
     for pair in pairs_in(datasets):
         found = pair.comparison()
+        where = pair.separation.text()
+        where = "" if where == "-" else f" (from the line of sight: {where})"
         if not found.count:
-            parts.append(f"{pair.name}: emulated only.")
+            parts.append(f"{pair.name}{where}: emulated only.")
             continue
         spread = (
             f", scatter {number(100 * found.scatter, 2)} % where the errors of both explain "
@@ -170,7 +190,8 @@ def describe_agreement(datasets: Sequence[Dataset]) -> str:
         error = f" ± {number(found.ratio_error, 2)}" if np.isfinite(found.ratio_error) else ""
         several = "batch" if found.count == 1 else "batches"
         parts.append(
-            f"{pair.name}: emulated over measured {number(found.ratio, 3)}{error} in {found.count} {several}{spread}."
+            f"{pair.name}{where}: emulated over measured {number(found.ratio, 3)}{error} in {found.count} "
+            f"{several}{spread}."
         )
     return " ".join(parts) or "No product names a scintillometer."
 

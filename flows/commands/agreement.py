@@ -52,7 +52,8 @@ def compare(
 
     Each profile is averaged along the path as the scintillometer weights it, with the error that its posterior gives,
     and put beside what the instrument measured in the same time: ratio, bias, regression, scatter, and the scatter that
-    the errors of both explain.
+    the errors of both explain. The last column says how far the instrument stands from the line of sight; with
+    height_scaling = "free_convection" and its heights, profiles are carried to the height of its beam as h^(-4/3).
 
     \b
     coslidar compare campaign.toml --average '30 min' -o agreement.svg --csv agreement.csv
@@ -84,7 +85,7 @@ def compare(
         click.echo(f"coslidar: {safe(warning)}", err=True)
     click.echo(
         f"{'scintillometer':<16} {'windows':>7} {'ratio':>14} {'bias (m^(-2/3))':>20} {'slope':>14} {'corr.':>6} "
-        f"{'scatter':>8} {'expected':>8} saturated"
+        f"{'scatter':>8} {'expected':>8} {'saturated':>9}  separation"
     )
     length = float(np.max(datasets[0]["z_bounds"].values))
     for station, pair in zip(stations, pairs, strict=True):
@@ -108,7 +109,7 @@ def _line(pair: Pair, found: Comparison, beyond: int) -> str:
         f"{pair.name:<16.16} {found.count:>7} {number(found.ratio, found.ratio_error, '.3f'):>14} "
         f"{number(found.bias, found.bias_error, '.1e'):>20} {number(found.slope, found.slope_error, '.2f'):>14} "
         f"{number(found.correlation, float('nan'), '.3f'):>6} {number(found.scatter, float('nan'), '.3f'):>8} "
-        f"{number(found.expected_scatter, float('nan'), '.3f'):>8} {beyond}"
+        f"{number(found.expected_scatter, float('nan'), '.3f'):>8} {beyond:>9}  {pair.separation.text()}"
     )
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from coslidar.flows.settings import InputError, load
-from coslidar.flows.surroundings import slice_heights_of, surroundings_of, with_heights
+from coslidar.flows.surroundings import surroundings_of, with_heights
+from coslidar.pipeline.beam_heights import sight_heights
 from coslidar.pipeline.geometry import SliceGrid
 from coslidar.pipeline.parameters import Header
 from coslidar.pipeline.surroundings import Surroundings
@@ -75,12 +76,16 @@ def test_everything_said(tmp_path: Path) -> None:
 
 
 def test_heights_of_a_header() -> None:
-    assert slice_heights_of(header({"length": "2670 m", "height": "23 m"}, []), GRID) == pytest.approx(
-        np.full(12, 23.0)
-    )
-    assert slice_heights_of(header({"length": "2670 m"}, []), GRID) is None
-    some = slice_heights_of(header({"length": "2670 m", "heights": [["0 m", "8 m"], ["2 km", "28 m"]]}, []), GRID)
-    assert some is not None
+    level = sight_heights(header({"length": "2670 m", "height": "23 m"}, []).path, GRID)
+    assert level is not None
+    assert level.effective == pytest.approx(np.full(12, 23.0))
+    assert level.borders == pytest.approx(np.full(13, 23.0))
+    assert sight_heights(header({"length": "2670 m"}, []).path, GRID) is None
+    slope = sight_heights(header({"length": "2670 m", "heights": [["0 m", "8 m"], ["2 km", "28 m"]]}, []).path, GRID)
+    assert slope is not None
+    assert slope.borders[:9] == pytest.approx(8 + 2.225 * np.arange(9))
+    assert np.isnan(slope.borders[9:]).all()
+    some = slope.effective
     assert np.isfinite(some).sum() == 8  # the ninth slice reaches beyond the last point
     assert some[:8] == pytest.approx(8 + GRID.centres[:8] / 100, rel=0.01)
 
