@@ -963,7 +963,6 @@ def _grown(
     made_of: dict[str, Any] = {
         "inputs": plan.inputs,
         "fingerprint": plan.fingerprint,
-        "codec": codec,
         # Other versions may write other bytes.
         "versions": {name: version(name) for name in ("coslidar", "zarr", "numcodecs")},
     }
@@ -974,7 +973,7 @@ def _grown(
     elif dtype is None:
         dtype = np.dtype(survey(plan, progress).dtype)
     length = min(chunk_frames(plan.frame_shape, dtype, chunk), plan.n_frames)
-    made_of |= {"dtype": dtype.name, "chunk_frames": length}
+    made_of |= {"dtype": dtype.name, "chunk_frames": length, "codec": codec}
     n_chunks = -(-plan.n_frames // length)
     partial = Partial(folder, made_of)
 

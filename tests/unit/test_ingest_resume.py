@@ -206,6 +206,16 @@ def test_what_was_done_before_a_kill_is_neither_read_nor_made_again(
         assert os.listdir(output.parent) == [name], moment
 
 
+def test_other_options_need_no_second_look_at_the_pixels(
+    tmp_path: Path, source: Path, read: list[tuple[str, int]]
+) -> None:
+    """The type that holds them is as it was, so that they are read once and not twice."""
+    interrupt(tmp_path / "o.zarr", tmp_path / "wide.npy", after=8)
+    read.clear()
+    assert "begins anew" in run(tmp_path / "o.zarr", tmp_path / "wide.npy", options=("--codec", "zstd")).output
+    assert sum(count for _, count in read) == N
+
+
 def test_the_bytes_of_a_zip_do_not_depend_on_when_it_is_made(
     tmp_path: Path, source: Path, frames: NDArray[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
