@@ -21,6 +21,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ModelWrapValidatorHandler,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -454,11 +455,13 @@ class Scintillometer(HeaderPart):
     series: SeriesFile | None = None
     """What it measured."""
 
-    @model_validator(mode="after")
-    def _heights_to_scale_to(self) -> Scintillometer:
-        if self.height_scaling != "none" and self.heights is None:
-            raise ValueError("height_scaling needs heights, of the beam above the ground at both of its ends")
-        return self
+    @field_validator("height_scaling")
+    @classmethod
+    def _heights_to_scale_to(cls, scaling: str, info: ValidationInfo) -> str:
+        # Not of the whole model, which is not looked at while any of its keys is wrong. Wrong heights are not in data.
+        if scaling != "none" and info.data.get("heights", ()) is None:
+            raise ValueError("it needs heights, those of the beam above the ground at both of its ends")
+        return scaling
 
     def ends(self, path_length: float) -> tuple[float, float]:
         """Distances of both apertures from the pupil, m."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from . import air, surface_layer
 from .comparison import compare
@@ -101,14 +101,14 @@ class Terrain(Parameters):
     refraction: float = Field(default=0.13, ge=-3, le=3)
     """Curvature of the light over that of the Earth."""
 
-    @model_validator(mode="after")
-    def _one_of_each(self) -> Terrain:
-        for end in ("pupil", "sources"):
-            if (getattr(self, f"{end}_height") is None) == (getattr(self, f"{end}_elevation") is None):
-                raise ValueError(
-                    f"give either {end}_height (above the ground) or {end}_elevation (on the file's datum)"
-                )
-        return self
+    @field_validator("pupil_elevation", "sources_elevation")
+    @classmethod
+    def _one_of_each(cls, elevation: float | None, info: ValidationInfo) -> float | None:
+        end = str(info.field_name).removesuffix("_elevation")
+        # A height that is wrong is not in data, and has its own message.
+        if f"{end}_height" in info.data and (info.data[f"{end}_height"] is None) == (elevation is None):
+            raise ValueError(f"give either {end}_height (above the ground) or {end}_elevation (on the file's datum)")
+        return elevation
 
 
 class SurroundingsParameters(Parameters):

@@ -435,10 +435,14 @@ def faults(error: ValidationError, origin: str, prefix: str = "") -> list[str]:
             message = str(context["reason"]).replace(_KEY, location)
         elif kind == "value_error":
             message = str(context.get("error", message))
+        elif kind in ("tuple_type", "list_type"):
+            message = "it should be a list; write its values in brackets, [..., ...]"
         else:
             message = message.replace("Input should", "it should")
         if not location:
             sentences.append(f"{origin}: {message}")
+        elif fault["input"] is None:  # nothing was written there
+            sentences.append(f"{origin}: {location}: {message}")
         else:
             sentences.append(f"{origin}: {location} = {_found(fault['input'])}: {message}")
     return [safe(sentence) for sentence in sentences]

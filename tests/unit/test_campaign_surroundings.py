@@ -109,6 +109,32 @@ def test_heights_of_a_header() -> None:
         (TERRAIN.replace("20 m", "-1 m"), None, ["terrain.pupil_height"]),
         (TERRAIN.replace("625 m", "580 m"), None, ["below the ground"]),
         (TERRAIN, {"length": "3 km"}, ["the transect runs from 0 m to 2670 m"]),
+        (
+            LAS + 'offset = "1 s"\nheights = "4 m"\nheight_scaling = "free"\n' + TERRAIN.replace("pupil_h", "pupl_h"),
+            None,
+            [
+                "scintillometers[0].offset = '1 s': 's' is a duration",
+                "scintillometers[0].heights = '4 m': it should be a list; write its values in brackets",
+                "scintillometers[0].height_scaling = 'free': it should be 'none' or 'free_convection'",
+                "terrain.pupl_height",
+                "give either pupil_height",
+            ],
+        ),
+        (
+            LAS.replace("0.88 um", "0.88") + 'height_scaling = "free_convection"\n',
+            None,
+            ["the unit is missing", "height_scaling = 'free_convection': it needs heights"],
+        ),
+        (
+            LAS + 'heights = ["2 m", "2 m"]\n',
+            {"length": "2670 m", "heights": [["0 m", "20 m"], ["1335 m", "3 m"], ["2670 m", "20 m"]]},
+            ["scintillometers[0]: the beam runs", "below the ground"],
+        ),
+        (
+            LAS + 'heights = ["2 m", "9 m"]\nheight_scaling = "free_convection"\n',
+            None,
+            ["scintillometers[0]: height_scaling needs the height of the line of sight"],
+        ),
         (LAS + 'end = "9 km"\n', None, ["scintillometers[0]", "outside the slices"]),
         (LAS + 'series = { file = "weather.csv", columns = { cn2 = "RH" } }\n', None, ["unit of column 'RH'"]),
     ],

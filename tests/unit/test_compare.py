@@ -72,6 +72,25 @@ def test_batches_beside_a_scintillometer(folder: Path) -> None:
     assert (folder / "out.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_beside_the_line_of_sight(folder: Path) -> None:
+    """Twice the height all along, so 2^(-4/3) of Cn2 and of its errors; the product says 10 to 30 m."""
+    heights = 'offset = "-120 m"\nheights = ["18 m", "62 m"]\n'  # twice those at the borders, 9 m and 31 m
+    values = []
+    for scaling in ("none", "free_convection"):
+        (folder / "campaign.toml").write_text(f'{LAS}{heights}height_scaling = "{scaling}"\n')
+        done = run(folder, "--csv", str(folder / "out.csv"))
+        assert done.exit_code == 0, done.output
+        line = next(line for line in done.output.splitlines() if line.startswith("A  "))
+        assert "120 m left, " in line
+        assert " m above" in line
+        assert ("carried as h^(-4/3)" in line) == (scaling == "free_convection")
+        with (folder / "out.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        values.append([[float(row[f"emulated{what} [m^(-2/3)]"]) for what in ("", " error")] for row in rows])
+    # The made heights of slices are not those of their borders: 20 % of a height that counts little.
+    assert np.array(values[1]) / np.array(values[0]) == pytest.approx(2 ** (-4 / 3), rel=0.05)
+
+
 def test_windows_of_their_own(folder: Path) -> None:
     done = run(folder, "--average", "10 min", "--coverage", "0.1", "--whole", "--csv", str(folder / "out.csv"))
     assert done.exit_code == 0, done.output
