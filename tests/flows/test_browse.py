@@ -14,18 +14,15 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import httpx
-import made_products
 import numpy as np
 import pytest
+from browsing import HOSTILE, HOSTILE_NAME, Server, hostile_catalog
 from small_runs import command, environment, wait_for
 
 from coslidar.catalog import open_catalog
 from coslidar.catalog.products import open_product
 from coslidar.catalog.report import BATCH_PANELS, TIME_PANELS
 from coslidar.catalog.store import Catalog
-
-HOSTILE_NAME = "evening.2"
-HOSTILE = '"><script>alert(1)</script>'
 
 
 class Seen(HTMLParser):
@@ -57,41 +54,7 @@ class Seen(HTMLParser):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A catalog: one archive under two lineages, and one whose header and run are hostile."""
-    root = tmp_path_factory.mktemp("browse") / "results"
-    with Catalog(root) as catalog:
-        run = catalog.start_run(command=f"coslidar run {HOSTILE}")
-        catalog.publish(made_products.product(1), run)
-        catalog.publish(made_products.product(2, attributes={"sampling": "midpoint"}), run)
-        other = made_products.product(
-            3, archive=HOSTILE_NAME, archive_identity="f" * 64, sources=[HOSTILE, "top"], attributes={"site": HOSTILE}
-        )
-        catalog.publish(other, run, header={"name": HOSTILE})
-        catalog.record_failure(run, HOSTILE, f"no light in {HOSTILE}")
-        catalog.finish_run(run)
-    return root
-
-
-class Server:
-    """A running page and a client that knows its token."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-        said = ""
-        while "token=" not in said:
-            line = process.stdout.readline()  # type: ignore[union-attr]
-            assert line, f"the server ended: {process.stderr.read()}"  # type: ignore[union-attr]
-            said += line
-        self.address = re.search(r"http://\S+", said)[0]  # type: ignore[index]
-        self.base, self.token = self.address.split("/?token=")
-        self.client = httpx.Client(
-            base_url=self.base, headers={"authorization": f"Bearer {self.token}"}, timeout=60, trust_env=False
-        )
-
-    def page(self, path: str, status: int = 200) -> str:
-        answer = self.client.get(path)
-        assert answer.status_code == status, f"{path}: {answer.status_code}\n{answer.text[:500]}"
-        return answer.text
+    return hostile_catalog(tmp_path_factory.mktemp("browse") / "results")
 
 
 @pytest.fixture(scope="module")
@@ -254,23 +217,6 @@ def test_nothing_but_reading(server: Server, folder: Path) -> None:
             with pytest.raises(Exception, match="readonly"), catalog.database.write() as connection:
                 connection.exec_driver_sql(statement)
     assert sqlite3.connect(folder / "catalog.sqlite").execute("select count(*) from batch").fetchone() == (9,)
-
-
-@pytest.mark.slow
-def test_a_browser_shows_the_pages_without_a_complaint(server: Server, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no chromium: the pages are not opened in a browser")
-    for path, content in (("/", 'id="batches"'), ("/product/1/batch/0", "<svg"), ("/compare?a=1&b=2", "<svg")):
-        address = f"{server.base}{path}{'&' if '?' in path else '?'}token={server.token}"
-        done = subprocess.run(
-            [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr", "--dump-dom",
-             f"--user-data-dir={tmp_path / 'profile'}", address],
-            check=True, capture_output=True, text=True, timeout=120,
-        )  # fmt: skip
-        # A violated policy, an error of the script and a request that was refused are all written to the console.
-        assert "CONSOLE" not in done.stderr, path
-        assert content in done.stdout, path
 
 
 def test_what_is_not_there_is_said(server: Server) -> None:
