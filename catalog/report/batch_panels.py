@@ -476,10 +476,10 @@ def describe_criterion(dataset: Dataset, batch: int) -> str:
     curve = of_batch(dataset, "criterion", batch)
     chosen = log_mu(scalar(dataset, "mu", batch))
     if grid is None or curve is None or not np.isfinite(curve).any():
-        return f"There is no criterion curve; log10(mu) is {number(chosen, 4)}."
+        return f"There is no criterion curve; log₁₀ μ is {number(chosen, 4)}."
     least = float(grid[np.nanargmin(curve)])
     return (
-        f"Criterion for log10(mu) from {number(float(grid[0]), 4)} to {number(float(grid[-1]), 4)}. "
+        f"Criterion for log₁₀ μ from {number(float(grid[0]), 4)} to {number(float(grid[-1]), 4)}. "
         f"Its minimum on the grid is at {number(least, 4)}; the chosen value is {number(chosen, 4)}."
     )
 

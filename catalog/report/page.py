@@ -218,8 +218,8 @@ TIME_PANELS = (
     TimePanel(
         "selection",
         "How sure is the choice of the regularisation?",
-        "A column is the criterion of one batch, relative to its own minimum: the brighter, the closer to it. The line "
-        "with open diamonds is the chosen μ. A broad bright band means that the data hardly tell.",
+        "A column is the criterion of one batch, relative to its own minimum: the brighter, the closer to it. An open "
+        "diamond is the chosen μ. A broad bright band means that the data hardly tell.",
         (10.0, 4.0),
         over.compose_selection,
         over.describe_selection,

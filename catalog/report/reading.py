@@ -79,7 +79,8 @@ def of_batch(dataset: Dataset, name: str, batch: int) -> Floats | None:
     """A variable of one batch as float64, None where the product has no such variable."""
     if name not in dataset:
         return None
-    variable = dataset[name]
+    # Without coordinates: a page asks for thousands of single numbers.
+    variable = dataset.variables[name]
     return np.asarray((variable.isel(time=batch) if "time" in variable.dims else variable).values, dtype=np.float64)
 
 

@@ -182,9 +182,7 @@ def draw_time_distance(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     ax.set_ylim(min(edges(d)[0] for d in products), max(edges(d)[-1] for d in products))
     ax.set_ylabel("distance from the pupil z (m)")
     time_axis(ax, products)
-    # The last column may have been widened beyond the last batch.
-    low, high = ax.get_xlim()
-    ax.set_xlim(low, max(high, max(limit[-1, 1] for limit in columns) + 0.005 * (high - low)))
+    _show_columns(ax, columns)
     if image is not None:
         bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
         bar.set_label(r"$C_n^2$ (m$^{-2/3}$)")
@@ -205,6 +203,20 @@ def _visible(limits: Sequence[Floats]) -> list[Floats]:
         room = limit[:, 0] + np.minimum(wanted, 0.9 * (following - limit[:, 0]))
         widened.append(np.stack([limit[:, 0], np.maximum(limit[:, 1], room)], axis=1))
     return widened
+
+
+def _show_columns(ax: Axes, columns: Sequence[Floats]) -> None:
+    """Make room for the last column, which may have been widened beyond the last batch."""
+    low, high = ax.get_xlim()
+    ax.set_xlim(low, max(high, max(limit[-1, 1] for limit in columns) + 0.005 * (high - low)))
+
+
+def _in_columns(line: Series, columns: Sequence[Floats]) -> Series:
+    """The same numbers in the middle of the columns that stand for their batches."""
+    drawn = np.concatenate(columns)
+    drawn = drawn[np.argsort(drawn[:, 0])]
+    own = np.searchsorted(drawn[:, 0], line.days, side="right") - 1
+    return Series(drawn[own].mean(axis=1), line.values, line.half)
 
 
 def _active(dataset: Dataset, cn2: Floats) -> NDArray[np.bool_]:
@@ -421,7 +433,7 @@ def compose_fit(figure: Figure, datasets: Sequence[Dataset]) -> None:
 def describe_fit(datasets: Sequence[Dataset]) -> str:
     """Say median and range of chi2 and of log mu."""
     parts = []
-    for name, words in (("chi2_reduced", "chi2 per datum"), ("mu", "log10(mu)")):
+    for name, words in (("chi2_reduced", "χ² per datum"), ("mu", "log₁₀ μ")):
         line = series(datasets, name)
         if line is None:
             continue
@@ -458,9 +470,12 @@ def draw_selection(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
             )  # fmt: skip
     line = series(products, "mu")
     if line is not None:
-        _follow(ax, line.mapped(np.log10), "chosen", color=RED, marker="D", ls="-", ms=5, mfc=PAPER)
+        _follow(
+            ax, _in_columns(line, columns).mapped(np.log10), "chosen", color=RED, marker="D", ls="-", ms=5, mfc=PAPER
+        )
     ax.set_ylabel(r"$\log_{10}\,\mu$")
     time_axis(ax, products)
+    _show_columns(ax, columns)
     if image is not None:
         bar = ax.figure.colorbar(image, ax=ax, fraction=0.04, pad=0.015, extend="both")
         bar.set_label("criterion / minimum − 1")
@@ -496,9 +511,11 @@ def draw_averages(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     positive = []
     if mean is not None:
         if low is not None and high is not None:
-            ax.fill_between(mean.days, low.values, high.values, color=BLUE, alpha=0.25, lw=0, label="its 68 % interval")
+            words = "its 68 % interval"
             if mean.values.size <= MARKED:
-                ax.vlines(mean.days, low.values, high.values, color=BLUE, lw=1.4)
+                ax.vlines(mean.days, low.values, high.values, color=BLUE, lw=1.4, label=words)
+            else:
+                ax.fill_between(mean.days, low.values, high.values, color=BLUE, alpha=0.25, lw=0, label=words)
         _follow(ax, mean, "mean along the path", color=BLUE, marker="D", ls="-", ms=5)
         positive.append(mean.values)
     count = max(dataset.sizes.get("scintillometer", 0) for dataset in products)
