@@ -52,7 +52,12 @@ def reduced(maps: np.ndarray, flux_variance: float = 0.0) -> batch.ReducedBatch:
 
 
 def retrieve(
-    matrix: np.ndarray, maps: np.ndarray, selector: Any = None, flux_variance: float = 0.0, **inversion: Any
+    matrix: np.ndarray,
+    maps: np.ndarray,
+    selector: Any = None,
+    flux_variance: float = 0.0,
+    factors: np.ndarray | None = None,
+    **inversion: Any,
 ) -> batch.BatchResult:
     model = batch.Model(
         geometry=GEOMETRY,
@@ -63,6 +68,7 @@ def retrieve(
         selector=selector or GCV(),
         inversion=InversionParameters(**inversion),
         scintillometers=np.linspace(1, 2, matrix.shape[1])[None],
+        height_factors=factors,
     )
     return batch.retrieve(reduced(maps, flux_variance), model)
 
@@ -102,6 +108,18 @@ def test_average_of_a_scintillometer_is_the_weighted_mean(matrix: np.ndarray) ->
     np.testing.assert_allclose(found["cn2_path_average"], [expected], rtol=1e-12)
     low, high = found["cn2_path_average_interval_68"][0]
     assert low < expected < high
+
+
+def test_carried_to_another_height_with_all_errors(matrix: np.ndarray) -> None:
+    """One factor for all slices multiplies the average, its error and its interval; zero for half of them leaves half."""
+    maps = matrix @ np.full(6, CN2)
+    plain, twice = (retrieve(matrix, maps, factors=factors).values for factors in (None, np.full((1, 6), 2.0)))
+    for name in ("cn2_path_average", "cn2_path_average_standard_error", "cn2_path_average_interval_68"):
+        np.testing.assert_allclose(twice[name], 2 * plain[name], rtol=1e-12)
+    shares = np.linspace(1, 2, 6) / 9 * np.repeat([0.0, 3.0], 3)
+    half = retrieve(matrix, maps, factors=np.repeat([[0.0, 3.0]], 3, axis=1)).values
+    np.testing.assert_allclose(half["cn2_path_average"], [shares @ plain["cn2"]], rtol=1e-12)
+    np.testing.assert_array_equal(half["cn2"], plain["cn2"])
 
 
 def test_intervals_hold_68_percent_of_a_known_posterior(matrix: np.ndarray) -> None:
