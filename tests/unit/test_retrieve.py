@@ -111,7 +111,7 @@ def test_average_of_a_scintillometer_is_the_weighted_mean(matrix: np.ndarray) ->
 
 
 def test_carried_to_another_height_with_all_errors(matrix: np.ndarray) -> None:
-    """One factor for all slices multiplies the average, its error and its interval; zero for half of them leaves half."""
+    """One factor for all slices multiplies average, error and interval; zero for half of them leaves half."""
     maps = matrix @ np.full(6, CN2)
     plain, twice = (retrieve(matrix, maps, factors=factors).values for factors in (None, np.full((1, 6), 2.0)))
     for name in ("cn2_path_average", "cn2_path_average_standard_error", "cn2_path_average_interval_68"):
