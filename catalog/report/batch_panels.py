@@ -534,7 +534,7 @@ def draw_kernel_sums(ax: Axes, dataset: Dataset, batch: int = 0) -> Axes:
 def compose_kernels(figure: Figure, dataset: Dataset, batch: int) -> None:
     """Lay out the averaging kernels and their sums."""
     draw_averaging_kernels(figure.add_axes((0.105, 0.13, 0.575, 0.78)), dataset, batch)
-    sums = draw_kernel_sums(figure.add_axes((0.765, 0.13, 0.22, 0.78)), dataset, batch)
+    sums = draw_kernel_sums(figure.add_axes((0.76, 0.13, 0.215, 0.78)), dataset, batch)
     sums.set_yticklabels([])
 
 

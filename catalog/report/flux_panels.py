@@ -253,7 +253,7 @@ def draw_slice_flux(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
 
 def compose_heat_flux(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out the heat flux over time and distance, and by slice."""
-    above, below = _frame(figure, datasets, [2.9, 3.0], right=0.75)
+    above, below = _frame(figure, datasets, [2.9, 3.0], right=1.0)
     draw_heat_flux(above, datasets)
     draw_slice_flux(below, datasets)
     _lower(below)

@@ -6,7 +6,6 @@ import base64
 import hashlib
 import json
 import os
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
@@ -38,7 +37,19 @@ from .reading import (
 )
 from .style import figure_style
 from .svg import inline_svg
-from .words import NOTHING, clean, clock, interval, mapping, measured, number, offset, scientific, site_zone
+from .words import (
+    NOTHING,
+    clean,
+    clock,
+    interval,
+    mapping,
+    measured,
+    number,
+    offset,
+    raised_units,
+    scientific,
+    site_zone,
+)
 from .words import days as period
 
 if TYPE_CHECKING:
@@ -653,7 +664,7 @@ def render(
         There is no batch in the products.
     """
     from jinja2 import Environment, StrictUndefined
-    from markupsafe import Markup, escape
+    from markupsafe import Markup
 
     products = listed(datasets)
     if not products:
@@ -700,12 +711,6 @@ def render(
         # Markup is what this package wrote itself; everything else may come from the header of somebody's archive.
         finalize=lambda value: value if isinstance(value, Markup) else clean(value),
     )  # fmt: skip
-
-    def raised_units(text: str) -> Markup:
-        """Exponents written as ``m^(-2/3)`` set higher, everything else escaped."""
-        return Markup(
-            re.sub(r"\^\(([-0-9/]+)\)", r"<sup>\1</sup>", str(escape(clean(text)))).replace("<sup>-", "<sup>−")
-        )
 
     environment.filters["units"] = raised_units
 

@@ -253,7 +253,7 @@ def cn2_scale(datasets: Sequence[Dataset]) -> tuple[float, float] | None:
 
 def compose_time_distance(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out the figure of the time-distance map."""
-    draw_time_distance(_frame(figure, datasets, [3.3], right=0.75)[0], datasets)
+    draw_time_distance(_frame(figure, datasets, [3.3], right=1.15)[0], datasets)
 
 
 def describe_time_distance(datasets: Sequence[Dataset]) -> str:

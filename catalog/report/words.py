@@ -8,7 +8,10 @@ import math
 import re
 import zoneinfo
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
 
 #: Shown where there is no value.
 NOTHING = "–"
@@ -24,6 +27,14 @@ _UNSAFE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u206
 def clean(value: object) -> str:
     """Text of `value` with control characters, direction marks and lone surrogates made visible as ``\ufffd``."""
     return _UNSAFE.sub("\ufffd", str(value))
+
+
+def raised_units(text: str) -> Markup:
+    """Markup with exponents written as ``m^(-2/3)`` set higher, everything else escaped."""
+    from markupsafe import Markup, escape
+
+    raised = re.sub(r"\^\(([-0-9/]+)\)", r"<sup>\1</sup>", str(escape(clean(text))))
+    return Markup(raised.replace("<sup>-", "<sup>−"))
 
 
 def scientific(value: float, digits: int = 3) -> str:

@@ -30,7 +30,7 @@ from ...catalog.report import BATCH_PANELS, TIME_PANELS, render
 from ...catalog.report.batch_panels import profile_rows
 from ...catalog.report.reading import LEVELS, bounds, flag_names, flags, levels
 from ...catalog.report.two_lineages import differences, slice_rows, summary_rows, two_profiles_markup
-from ...catalog.report.words import clean, clock, interval, mapping, number
+from ...catalog.report.words import clean, clock, interval, mapping, number, raised_units
 from ...catalog.store import CatalogError
 from .panels import FORMATS, PANELS, Dataset, Drawn, figure_bytes, panel_markup
 
@@ -149,6 +149,7 @@ class Pages:
         self._templates.filters |= {
             "clock": clock, "query": lambda query: urlencode(query), "svg": Markup, "level": lambda n: LEVELS[n],
         }  # fmt: skip
+        self._templates.filters["units"] = raised_units
 
     def app(self) -> Starlette:
         """The application, without its guard."""

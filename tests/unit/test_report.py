@@ -90,6 +90,9 @@ def ink(figure: Any) -> np.ndarray:
     figure.set_dpi(60)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
+    # Nothing is cut off at the edge of the figure; letters are set to whole pixels, here as large as 1/60 inch.
+    drawn, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+    assert min(drawn.x0, drawn.y0, width - drawn.x1, height - drawn.y1) > -2 / 60, drawn
     return np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
 
 
@@ -311,6 +314,13 @@ def test_the_profile_is_drawn_where_it_is() -> None:
     np.testing.assert_allclose(drawn / shape, drawn[0] / shape[0])
     weighted = (cn2 - drawn) * shape / dataset["cn2_standard_error"].values[0] ** 2
     assert abs(weighted.sum()) < 1e-9 * np.abs(weighted).sum()
+
+
+def test_many_labels_of_the_colours_leave_room_for_their_name() -> None:
+    """Less than a decade has a label at every other step, and each of them is long."""
+    dataset = product(1)
+    dataset["cn2"][0], dataset["cn2_at_bound"][0] = np.linspace(6e-15, 5e-14, 12), 0
+    ink(report.figure(next(panel for panel in report.TIME_PANELS if panel.key == "map"), dataset))
 
 
 @pytest.mark.parametrize("cn2", [np.zeros(12), np.full(12, 3e-15), np.full(12, np.nan), np.full(12, 1e-300)])
