@@ -27,7 +27,10 @@ def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[st
 @click.command()
 @click.argument("inputs", metavar="CAMPAIGN.toml | PRODUCT | FOLDER", nargs=-1, required=True)
 @click.option(
-    "--format", "form", type=click.Choice(list(_ENDINGS)), default="csv", show_default=True, help="What to write."
+    "--format",
+    "form",
+    type=click.Choice(list(_ENDINGS)),
+    help="What to write.  [default: by the ending of the file, else csv]",
 )
 @click.option(
     "-o",
@@ -51,7 +54,7 @@ def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[st
 )
 def export(
     inputs: tuple[str, ...],
-    form: str,
+    form: str | None,
     output: Path,
     since: str | None,
     until: str | None,
@@ -69,6 +72,8 @@ def export(
     from ..chosen import choose
     from ..settings import InputError
 
+    if form is None:
+        form = next((name for name, ending in _ENDINGS.items() if output.suffix == f".{ending}"), "csv")
     if not output.is_dir() and not output.suffix:
         raise InputError([f"{output}: there is no such folder; make it first, or name a file with an ending"])
     if form != "netcdf" and (cf_strict or attributes):

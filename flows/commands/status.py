@@ -126,28 +126,31 @@ def text_lines(about: dict[str, Any], now: int) -> list[str]:
 
 
 @click.command()
-@click.argument("run", required=False)
+@click.argument("run", metavar="[CAMPAIGN.toml | RUN]", required=False)
 @click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("results"), show_default=True,
-    help="Folder of the catalog.",
+    "--out", type=click.Path(file_okay=False, path_type=Path),
+    help="Folder of the catalog.  [default: output of the campaign file, or ./results]",
 )  # fmt: skip
 @click.option("--json", "as_json", is_flag=True, help="Print JSON.")
-def status(run: str | None, out: Path, as_json: bool) -> None:
+def status(run: str | None, out: Path | None, as_json: bool) -> None:
     """Show what a run has done: finished, skipped and failed archives with reasons, rate, time left.
 
-    RUN is the beginning of its identity; without it the last run is shown, and one line for each of those before. It
-    works from any machine that sees the catalog. A run whose driver has died is shown as lost, with the command that
-    continues it.
+    RUN is the beginning of its identity; without it the last run is shown, and one line for each of those before. A
+    campaign file names the catalog. It works from any machine that sees the catalog. A run whose driver has died is
+    shown as lost, with the command that continues it.
     """
     import json
     from time import time_ns
 
     from ...catalog.heartbeats import life
     from ...pipeline.units import safe
-    from ..settings import InputError
+    from ..settings import InputError, load
     from ..times import write_time
     from .results import existing
 
+    if run is not None and run.endswith(".toml"):
+        out, run = out or load(Path(run)).output, None
+    out = out or Path("results")
     now = time_ns()
     with existing(out) as opened:
         runs = opened.runs()

@@ -42,6 +42,16 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
+def test_the_ending_names_the_format(file: Path, tmp_path: Path) -> None:
+    assert call(export, file, "-o", tmp_path / "x.nc").exit_code == 0
+    with xr.open_dataset(tmp_path / "x.nc") as read:
+        assert read.sizes["time"] == 3
+    written = call(export, file, "-o", tmp_path / "x.parquet").output.splitlines()
+    assert len(pandas.read_parquet(written[0])) == len(
+        pandas.read_csv(call(export, file, "-o", tmp_path / "x.csv").output.splitlines()[0])
+    )
+
+
 @pytest.mark.parametrize("form", ["csv", "parquet", "netcdf"])
 def test_a_folder_gets_a_file_a_day_named_by_site(file: Path, tmp_path: Path, form: str) -> None:
     folder = tmp_path / "out"

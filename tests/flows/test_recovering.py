@@ -310,6 +310,9 @@ def test_status_tells_what_failed_and_what_to_do(main_here: Main, recordings: li
     about = json.loads(main_here("status", about_run(out), "--out", out, "--json").out)
     assert (about["state"], about["seconds_left"], about["frames_read"]) == ("finished", None, 2 * FRAMES)
     assert [failure["transient"] for failure in about["failures"]] == [False, False]
+    campaign = tmp_path / "campaign.toml"
+    campaign.write_text(f"archives = []\noutput = '{out}'\n")
+    assert main_here("status", campaign).out.splitlines()[0] == lines[0]
     none = main_here("status", "ffffffff", "--out", out)
     assert (none.code, "no run begins with 'ffffffff'" in none.err) == (2, True)
 
