@@ -136,6 +136,8 @@ def draw_profile(
     Axes
         `ax`.
     """
+    from matplotlib.ticker import NullFormatter
+
     cn2 = of_batch(dataset, "cn2", batch)
     if cn2 is None or not np.isfinite(cn2).any():
         return note(ax, "no profile")
@@ -150,6 +152,9 @@ def draw_profile(
     bottom, top = scale
     ax.set_yscale("log")
     ax.set_ylim(bottom, top)
+    if top > 30 * bottom:
+        # Decades are enough then; the long names of the steps between them would need a wider margin.
+        ax.yaxis.set_minor_formatter(NullFormatter())
     ax.set_xlim(border[0], border[-1])
 
     steps = np.where(shown, cn2, np.nan)
