@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bench_extraction import MASK, SPOTS
+from bench_extraction import MASK, SPOTS, header
 from numpy.typing import NDArray
 from wave_frames import Truth, draw
 
 from coslidar.catalog import open_archive
 from coslidar.pipeline import batch, measurement
 from coslidar.pipeline.geometry import SliceGrid
-from coslidar.pipeline.parameters import CorrelationParameters, ExtractionParameters, Header, InversionParameters
+from coslidar.pipeline.parameters import CorrelationParameters, ExtractionParameters, InversionParameters
 from coslidar.pipeline.products import Measurements
 from coslidar.pipeline.response import response_matrix
 from coslidar.pipeline.spots import Calibration
@@ -48,29 +48,7 @@ METHODS = {
 GAIN, READ, BACKGROUND, LIGHT = 12.0, 60.0, 150.0, (10_000.0, 8_500.0)
 #: A tenth of the profile of a strongly turbulent afternoon, m^(-2/3).
 CN2 = 1e-15 * np.array([3.4, 3.4, 3.4, 3.4, 3.4, 0.17, 0.17, 10.2, 10.2, 0.34, 20.4, 20.4])
-HEADER = Header.model_validate(
-    {
-        "format": "shwfs-frames",
-        "format_version": 1,
-        "campaign": "bench",
-        "archive": "bench",
-        "instrument": {
-            "wavelength": "3.8 um",
-            "frame_rate": "142 Hz",
-            "pixel_scale": "27 urad",
-            "gain": "12 electron/count",
-            "subaperture_size": "7 cm",
-            "subaperture_mask": MASK,
-            "lenslet_origin": [0, 0],
-            "lenslet_pitch": [32, 32],
-        },
-        "path": {"length": "2670 m"},
-        "sources": [
-            {"name": "a", "position": ["0 m", "-0.4 m"], "fwhm": ["8.9 cm", "6.3 cm"], "spot": SPOTS[0]},
-            {"name": "b", "position": ["0 m", "0.4 m"], "fwhm": ["8.9 cm", "6.3 cm"], "spot": SPOTS[1]},
-        ],
-    }
-)
+HEADER = header(gain="12 electron/count")
 
 
 def exposed(light: Array, noise: bool, seed: int) -> tuple[Array, Calibration]:

@@ -18,8 +18,6 @@ from prefect.states import Completed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.utilities.annotations import unmapped
 
-from ..catalog.products import open_product
-from ..catalog.report import write_report
 from .artifacts import ProgressTable, link_report
 from .driver import ArchiveOutcome, Work, execute, process_archive
 from .run import session
@@ -115,6 +113,9 @@ def reprocess(
     State
         Number of archives by outcome; failed where an archive or a campaign was refused or failed.
     """
+    from ..catalog.products import open_product
+    from ..catalog.report import write_report
+
     counts: Counter[str] = Counter()
     faults: list[str] = []
     for name in campaigns:

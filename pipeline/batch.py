@@ -20,7 +20,6 @@ from . import (
     correlation,
     extraction,
     inversion,
-    measurement,
     posterior,
     strong_scintillation,
     timing,
@@ -30,19 +29,19 @@ from . import (
 )
 from .beam_heights import carried_weights
 from .geometry import MAP_KINDS
+from .measurement import BatchError as BatchError
+from .measurement import measure as measure  # the first stage of a batch
 from .parameters import SOURCES_USED
 from .products import INTENSITY_KINDS, MU_FACTORS, QUALITY_FLAGS, SCHEMA, SLOPE_KINDS, BatchResult, Measurements
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
     from .geometry import Geometry, SliceGrid
     from .parameters import (
         CorrelationParameters,
-        ExtractionParameters,
-        Header,
         InversionParameters,
     )
     from .protocols import HyperparameterSelector, Regulariser
@@ -58,10 +57,6 @@ RETRIEVE_VERSION = 6
 MIN_FRAMES = 64
 #: Shortest batch, s, in which a drift is told from slow turbulence.
 DRIFT = 60.0
-
-
-class BatchError(ValueError):
-    """A batch that cannot be processed, with the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,43 +120,6 @@ class Model:
     height_factors: NDArray[np.float64] | None = None
     strong: strong_scintillation.StrongScintillation | None = None
     surroundings: Surroundings | None = None
-
-
-def measure(
-    blocks: Iterable[NDArray[Any]],
-    time: NDArray[np.int64],
-    header: Header,
-    calibration: extraction.Calibration,
-    parameters: ExtractionParameters,
-) -> Measurements:
-    """Slopes and fluxes of the frames of one batch, block by block.
-
-    Parameters
-    ----------
-    blocks : iterable of ndarray, (n, row, col)
-        Consecutive raw frames; how they are cut does not matter.
-    time : ndarray of int64, (T,)
-        Time stamps of all of them.
-    header : Header
-        Header of the archive.
-    calibration : Calibration
-        Dark, flat, bad pixels.
-    parameters : ExtractionParameters
-        Method and window.
-
-    Returns
-    -------
-    Measurements
-
-    Raises
-    ------
-    BatchError
-        See :func:`coslidar.pipeline.measurement.measure`.
-    """
-    try:
-        return measurement.measure(blocks, time, header, calibration, parameters)
-    except measurement.MeasurementError as error:
-        raise BatchError(str(error)) from error
 
 
 def reduce(

@@ -33,7 +33,11 @@ if TYPE_CHECKING:
 EVERY = 8
 
 
-class MeasurementError(ValueError):
+class BatchError(ValueError):
+    """A batch that cannot be processed, with the reason."""
+
+
+class MeasurementError(BatchError):
     """Frames that cannot be measured, with the reason."""
 
 

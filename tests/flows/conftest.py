@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 from small_clusters import Cluster
-from small_runs import ARCHIVES, Finished, command, environment, family, scenario
+from small_runs import ARCHIVES, SETTINGS, Finished, command, environment, family, products, scenario
 
+from coslidar.flows.run import run
+from coslidar.flows.settings import load
 from coslidar.flows.simulate import simulate
 from coslidar.pipeline.lineage import checkout
 
@@ -139,3 +141,13 @@ def dask(tmp_path: Path, cache: Path) -> Iterator[Cluster]:
     made = Cluster(folder, cache)
     yield made
     made.close()
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
+    """Products of a run on this machine that nobody disturbs."""
+    out = tmp_path_factory.mktemp("undisturbed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COSLIDAR_HOME", str(cache))
+        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
+    return products(out)

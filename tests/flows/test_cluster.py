@@ -24,16 +24,6 @@ TOTAL = len(ARCHIVES) * BATCHES
 Call = Callable[..., Finished]
 
 
-@pytest.fixture(scope="module")
-def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
-    """Products of a run on this machine."""
-    out = tmp_path_factory.mktemp("local")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSLIDAR_HOME", str(cache))
-        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
-    return products(out)
-
-
 @pytest.mark.cluster
 def test_by_address_and_by_file(
     dask: Cluster, coslidar: Call, recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path

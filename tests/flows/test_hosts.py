@@ -11,24 +11,12 @@ from pathlib import Path
 
 import pytest
 from hosts import Hosts
-from small_runs import ARCHIVES, BATCHES, SETTINGS, Finished, products, run_arguments, wait_for
+from small_runs import ARCHIVES, BATCHES, Finished, products, run_arguments, wait_for
 
 from coslidar.catalog import open_catalog
-from coslidar.flows.run import run
-from coslidar.flows.settings import load
 
 Call = Callable[..., Finished]
 Start = Callable[..., "subprocess.Popen[str]"]
-
-
-@pytest.fixture(scope="module")
-def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
-    """Products of a run on this machine."""
-    out = tmp_path_factory.mktemp("local")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSLIDAR_HOME", str(cache))
-        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
-    return products(out)
 
 
 @pytest.fixture

@@ -21,21 +21,6 @@ Start = Callable[..., "subprocess.Popen[str]"]
 Call = Callable[..., Finished]
 
 
-@pytest.fixture(scope="module")
-def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
-    """Products of a run that nobody disturbs."""
-    from small_runs import SETTINGS
-
-    from coslidar.flows.run import run
-    from coslidar.flows.settings import load
-
-    out = tmp_path_factory.mktemp("undisturbed")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSLIDAR_HOME", str(cache))
-        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
-    return products(out)
-
-
 def correlations(out: Path) -> int:
     """Batches whose frames have been read and whose correlations are kept."""
     return sum(1 for _ in (out / "correlations").glob("??/*.npz"))

@@ -11,25 +11,14 @@ from pathlib import Path
 import psutil
 import pytest
 from slurm_server import Slurm
-from small_runs import SETTINGS, Finished, environment, family, products, run_arguments, wait_for
+from small_runs import Finished, environment, family, products, run_arguments, wait_for
 
 from coslidar.catalog import open_archive
 from coslidar.flows.jobs import submitted
-from coslidar.flows.run import run
 from coslidar.flows.run_parameters import JobParameters
 from coslidar.flows.settings import InputError, Unavailable, load
 
 Call = Callable[..., Finished]
-
-
-@pytest.fixture(scope="module")
-def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
-    """Products of a run on this machine."""
-    out = tmp_path_factory.mktemp("local")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSLIDAR_HOME", str(cache))
-        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
-    return products(out)
 
 
 def test_every_fault_of_where_to_compute_is_told(tmp_path: Path) -> None:

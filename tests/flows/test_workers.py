@@ -34,16 +34,6 @@ def preload(folder: Path, name: str, code: str) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def undisturbed(recordings: list[str], tmp_path_factory: pytest.TempPathFactory, cache: Path) -> dict[str, bytes]:
-    """Products of a run on this machine."""
-    out = tmp_path_factory.mktemp("local")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSLIDAR_HOME", str(cache))
-        run(load(archives=recordings, output=out, assignments=SETTINGS), prefect=False)
-    return products(out)
-
-
 @pytest.mark.cluster
 def test_a_late_worker_of_other_versions_computes_nothing(
     dask: Cluster,
