@@ -19,6 +19,7 @@ from ..catalog.measurements import MeasurementStore
 from ..pipeline import batch as stages
 from ..pipeline.extraction import Calibration
 from ..pipeline.units import safe
+from ..plugins.registry import KINDS
 from . import logs
 
 if TYPE_CHECKING:
@@ -210,18 +211,31 @@ def remember(archive: Archive) -> None:
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Versions of what can change a number, or could not talk to another version of itself."""
+    """Versions of what can change a number, or could not talk to another version of itself; plugins included."""
     import platform
-    from importlib.metadata import version
+    from importlib.metadata import entry_points, version
 
     names = ("coslidar", "numpy", "scipy", "numba", "zarr", "numcodecs", "dask", "distributed")
-    return {"python": platform.python_version(), **{name: version(name) for name in names}}
+    # Two checkouts of one release differ in their stages.
+    numbers = (stages.MEASURE_VERSION, stages.REDUCE_VERSION, stages.RESPONSE_VERSION, stages.RETRIEVE_VERSION)
+    plugins = {
+        point.dist.name: point.dist.version
+        for group, _ in KINDS.values()
+        for point in entry_points(group=group)
+        if point.dist is not None
+    }
+    return {
+        "python": platform.python_version(),
+        **plugins,
+        **{name: version(name) for name in names},
+        "stages of coslidar": ".".join(map(str, numbers)),
+    }
 
 
 def differences(theirs: dict[str, str], mine: dict[str, str], worker: str) -> list[str]:
     """What differs between a worker and the driver, both versions named."""
     return [
-        f"{name} is {theirs.get(name)} on worker {worker} and {found} here"
+        f"{name} is {theirs.get(name, 'not installed')} on worker {worker} and {found} here"
         for name, found in mine.items()
         if theirs.get(name) != found
     ]

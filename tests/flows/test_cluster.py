@@ -195,6 +195,14 @@ def test_versions_are_compared_and_both_named() -> None:
     assert f"python is 3.14.1 on worker tcp://b:1 and {mine['python']} here" in text
     assert "tcp://a:1" not in text
     assert "same environment" in text
+    # Another checkout of the same release computes other numbers; a plugin that is not there computes none.
+    stages, plugin = "stages of coslidar", "coslidar-example-plugin"
+    older = {**mine, stages: "0.0.0.0"}
+    del older[plugin]
+    assert tasks.differences(older, mine, "w") == [
+        f"{plugin} is not installed on worker w and {mine[plugin]} here",
+        f"{stages} is 0.0.0.0 on worker w and {mine[stages]} here",
+    ]
 
 
 def test_a_cluster_without_workers_or_without_coslidar_is_refused() -> None:
