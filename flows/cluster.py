@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..pipeline.units import safe
+from .caches import cache_folder
 from .jobs import submitted, tls_security
-from .settings import InputError, Unavailable, cache_folder
+from .settings import InputError, Unavailable
 from .tasks import differences, versions
 
 if TYPE_CHECKING:

@@ -24,8 +24,9 @@ from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from . import logs
 from .batches import FAILED, PATIENCE, Batches, Workers
+from .caches import cache_folder
 from .plan import ArchivePlan, plan_archive
-from .settings import InputError, Unavailable, cache_folder
+from .settings import InputError, Unavailable
 from .tasks import Origin, remember
 
 if TYPE_CHECKING:

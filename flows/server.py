@@ -51,7 +51,8 @@ def home() -> tuple[Path, IO[bytes]]:
     """
     import fcntl
 
-    from .settings import Unavailable, cache_folder
+    from .caches import cache_folder
+    from .settings import Unavailable
 
     number = 1
     while True:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import tomllib
 from dataclasses import dataclass, field, replace
@@ -67,13 +66,6 @@ KEPT = ("measurements",)
 #: Tables of a campaign file that replace or complete keys of the archives' headers.
 HEADER_TABLES = ("site", "instrument", "path", "sources", "scintillometers")
 _URL = re.compile(r"^[A-Za-z][A-Za-z0-9+.-]+://")
-
-
-def cache_folder() -> Path:
-    """Folder for what can be made again: COSLIDAR_HOME, or a folder in the user's cache."""
-    if given := os.environ.get("COSLIDAR_HOME"):
-        return Path(given)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coslidar"
 
 
 class InputError(ValueError):
