@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 MEASURE_VERSION = extraction.VERSION
 REDUCE_VERSION = 4
 RESPONSE_VERSION = 2
-RETRIEVE_VERSION = 6
+RETRIEVE_VERSION = 7
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64

@@ -1029,7 +1029,7 @@ class Profile:
         Number of independent data.
     resolution_length : ndarray, (k,)
         Length of path that each estimate stands for, m (:func:`~.uncertainty.resolution_length`); NaN where the
-        slices were not given.
+        data do not resolve the slice, and where the slices were not given.
     """
 
     cn2: Floats

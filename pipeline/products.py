@@ -143,7 +143,7 @@ SCHEMA = _schema(
     ("cn2_interval_68", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 68 %"),
     ("cn2_interval_95", "time z bound", "m^(-2/3)", "float64", "shortest interval of the posterior holding 95 %"),
     ("cn2_posterior_mean", "time z", "m^(-2/3)", "float64", "mean of the positive posterior of Cn2"),
-    ("resolution_length", "time z", "m", "float64", "length of path that an estimate stands for"),
+    ("resolution_length", "time z", "m", "float64", "path that an estimate stands for; NaN: not resolved"),
     ("cn2_path_mean", "time", "m^(-2/3)", "float64", "mean of Cn2 along the path"),
     ("cn2_path_mean_interval_68", "time bound", "m^(-2/3)", "float64", "shortest interval of it holding 68 %"),
     ("cn2_path_average", "time scintillometer", "m^(-2/3)", "float64", "mean of Cn2 as a scintillometer weights it"),

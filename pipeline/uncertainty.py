@@ -140,7 +140,13 @@ def resolution_length(kernel: Floats, grid: SliceGrid) -> Floats:
     """Resolution length of each slice from its averaging kernel.
 
     The thickness of the slice over the diagonal of the kernel, the reciprocal of the density of degrees of
-    freedom along the path (Purser & Huang 1993, J. Appl. Meteor. 32, 1092).
+    freedom along the path (Purser & Huang 1993, J. Appl. Meteor. 32, 1092, who show that widths of the kernel
+    mislead where it has side lobes, as those of Cn2 have).
+
+    No estimate stands for more than the path. One that answers by less than half both to its own slice (the
+    diagonal) and to a profile that rises everywhere (the area of the kernel, the part of the estimate that comes
+    from the data: Rodgers 2000, "Inverse Methods for Atmospheric Sounding", chapter 3) is more the prior's than the
+    data's: that slice is not resolved and has no length.
 
     Parameters
     ----------
@@ -152,10 +158,10 @@ def resolution_length(kernel: Floats, grid: SliceGrid) -> Floats:
     Returns
     -------
     ndarray, (k,)
-        m; never below the thickness of the slice, infinite where the estimate does not respond to its own
-        slice.
+        m; from the thickness of the slice to the length of all slices, NaN where the slice is not resolved.
     """
     thickness = np.asarray(grid.thickness, dtype=float)
-    density = np.clip(np.diag(kernel), 0.0, 1.0)
-    length = np.full(thickness.shape, np.inf)
-    return np.asarray(np.divide(thickness, density, out=length, where=density > 1e-12))
+    own = np.clip(np.diag(kernel), 0.0, 1.0)
+    path = np.full(thickness.shape, thickness.sum())
+    length = np.minimum(np.divide(thickness, own, out=path.copy(), where=own > 0), path)
+    return np.where((own < 0.5) & (kernel.sum(axis=1) < 0.5), np.nan, length)

@@ -543,6 +543,13 @@ def compose_kernels(figure: Figure, dataset: Dataset, batch: int) -> None:
     sums.set_yticklabels([])
 
 
+def _places(border: Floats, chosen: NDArray[np.bool_]) -> str:
+    """Slices in words, neighbours as one stretch."""
+    turns = np.flatnonzero(np.diff(np.concatenate([[False], chosen, [False]])))
+    pairs = zip(turns[::2], turns[1::2], strict=True)
+    return ", ".join(f"{number(border[first], 4)} to {number(border[last], 4)} m" for first, last in pairs)
+
+
 def describe_kernels(dataset: Dataset, batch: int) -> str:
     """Say how many slices the data determine."""
     kernel = of_batch(dataset, "averaging_kernel", batch)
@@ -550,15 +557,17 @@ def describe_kernels(dataset: Dataset, batch: int) -> str:
         return "This batch has no averaging kernels."
     freedom = scalar(dataset, "degrees_of_freedom", batch)
     text = f"{number(freedom, 3)} degrees of freedom for {kernel.shape[0]} slices. " if np.isfinite(freedom) else ""
+    border = edges(dataset)
     if kernel.shape[0] == kernel.shape[1]:
-        border, own = edges(dataset), np.diag(kernel)
-        weak = np.flatnonzero(own < 0.5)
-        places = ", ".join(f"{number(border[i], 4)} to {number(border[i + 1], 4)} m" for i in weak)
+        weak = np.diag(kernel) < 0.5
         text += (
-            f"Slices that answer by less than half to their own turbulence: {places}."
-            if weak.size
-            else "Every slice answers by more than half to its own turbulence."
+            f"Slices that answer by less than half to their own turbulence: {_places(border, weak)}. "
+            if weak.any()
+            else "Every slice answers by more than half to its own turbulence. "
         )
+    length = of_batch(dataset, "resolution_length", batch)
+    if length is not None and np.isfinite(length).any() and (lost := np.isnan(length)).any():
+        text += f"Not resolved, more the prior's than the data's: {_places(border, lost)}."
     return text.strip()
 
 

@@ -496,10 +496,12 @@ def geometry(products: Sequence[Dataset]) -> list[dict[str, str]]:
         found |= dict.fromkeys(row for row in rows if row[1])
     lengths = [values(dataset, "resolution_length") for dataset in products]
     known = np.concatenate([np.ravel(length) for length in lengths if length is not None] or [np.empty(0)])
-    if (known := known[np.isfinite(known)]).size:
-        found[("Resolution of the profiles", number(float(np.median(known)), 3), "m",
-               f"length of path that a slice stands for: median; {number(float(known.min()), 3)} to "
-               f"{number(float(known.max()), 3)}")] = None  # fmt: skip
+    if (resolved := known[np.isfinite(known)]).size:
+        remark = (f"length of path that a slice stands for: median; {number(float(resolved.min()), 3)} to "
+                  f"{number(float(resolved.max()), 3)}")  # fmt: skip
+        if lost := known.size - resolved.size:
+            remark += f"; {number(100 * lost / known.size, 2)} % of the slices are not resolved"
+        found[("Resolution of the profiles", number(float(np.median(resolved)), 3), "m", remark)] = None
     return [dict(zip(("name", "value", "unit", "remark"), row, strict=True)) for row in found]
 
 

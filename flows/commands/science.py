@@ -318,9 +318,10 @@ def invert(
 
     OUT.npz holds cn2 and error (MAP bar), (k,) or (draws, k), hpd68 and hpd95, (k, 2) or (draws, k, 2), the shortest
     intervals that hold 68 and 95 % of the positive posterior, posterior_mean, mu, log_mu_grid, criterion,
-    n_independent, and error_ml, averaging_kernel, degrees_of_freedom, resolution_length (m; in slices where none are
-    given), chi2_reduced, nuisance, nuisance_error, nuisance_names, rows. Without a posterior, where neither data nor
-    prior bound the profile, intervals reach from 0 to infinity and posterior_mean is NaN.
+    n_independent, and error_ml, averaging_kernel, degrees_of_freedom, resolution_length (m, or slices where none are
+    given; NaN in slices that the data do not resolve), chi2_reduced, nuisance, nuisance_error, nuisance_names, rows.
+    Without a posterior, where neither data nor prior bound the profile, intervals reach from 0 to infinity and
+    posterior_mean is NaN.
     """
     import numpy as np
 

@@ -502,6 +502,21 @@ def test_geometry_is_told_with_units(source: str) -> None:
         assert expected in text, expected
 
 
+def test_slices_without_resolution_are_said() -> None:
+    from coslidar.catalog.report.batch_panels import describe_kernels
+    from coslidar.catalog.report.page import geometry
+
+    dataset = product(2)
+    border = dataset["z_bounds"].values[:, 0]
+    assert "Not resolved" not in describe_kernels(dataset, 0)
+    dataset["resolution_length"][0, [3, 10, 11]] = np.nan
+    said = describe_kernels(dataset, 0)
+    assert f"Not resolved, more the prior's than the data's: {border[3]:.1f} to {border[4]:.1f} m, " in said
+    assert said.endswith(f" m, {border[10]:.0f} to 2670 m.")
+    remark = {row["name"]: row["remark"] for row in geometry([dataset])}["Resolution of the profiles"]
+    assert remark.endswith("500 to 500; 12 % of the slices are not resolved"), remark
+
+
 def test_spectrum_and_checks_are_said() -> None:
     from coslidar.catalog.report.check_panels import describe_checks, describe_spectrum
 

@@ -93,5 +93,31 @@ def test_kernel_tends_to_the_identity_without_prior(problem):
 
 def test_resolution_is_the_slice_where_it_is_resolved():
     grid = SliceGrid((0.0, 100.0, 300.0, 400.0))
-    kernel = np.diag([1.0, 0.5, 0.0])
-    np.testing.assert_allclose(uncertainty.resolution_length(kernel, grid), [100, 400, np.inf])
+    np.testing.assert_allclose(uncertainty.resolution_length(np.diag([1.0, 0.5, 0.0]), grid), [100, 400, np.nan])
+    # Rounding of the kernel neither sharpens a slice nor gives one that answers the wrong way round a length.
+    np.testing.assert_allclose(uncertainty.resolution_length(np.diag([1.1, 1.0, -0.2]), grid), [100, 200, np.nan])
+
+
+@pytest.mark.parametrize(("area", "expected"), [(1.0, 400.0), (0.8, 400.0), (0.51, 400.0), (0.49, np.nan)])
+def test_nothing_stands_for_more_than_the_path(area, expected):
+    """A mean over the path is the coarsest estimate; with less than half of it from the data it is the prior's."""
+    grid = SliceGrid((0.0, 50.0, 100.0, 300.0, 400.0))
+    kernel = area * np.tile(grid.thickness / 400.0, (4, 1))
+    np.testing.assert_allclose(uncertainty.resolution_length(kernel, grid), expected, rtol=1e-12)
+
+
+def test_side_lobes_do_not_take_the_resolution_away():
+    """A slice that answers to itself is resolved, whatever a uniform profile would do to it."""
+    grid = SliceGrid.uniform(300.0, 3)
+    kernel = np.array([[0.8, -0.4, -0.1], [0.5, 0.1, 0.4], [0.1, 0.1, 0.2]])
+    np.testing.assert_allclose(uncertainty.resolution_length(kernel, grid), [125, 300, np.nan])
+
+
+def test_lengths_count_the_degrees_of_freedom(problem):
+    """Thickness over length sums up to the degrees of freedom, as long as every slice answers to itself."""
+    grid = SliceGrid((0.0, 50.0, 500.0, 1000.0, 1700.0, 2670.0))
+    for mu in (1e15, 1e26, 1e28):
+        length = uncertainty.resolution_length(uncertainty.averaging_kernel(problem, mu), grid)
+        assert (np.asarray(grid.thickness) / length).sum() == pytest.approx(
+            uncertainty.degrees_of_freedom(problem, mu), rel=1e-6
+        )
