@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .options import OUT, SINCE, UNTIL
+
 if TYPE_CHECKING:
     from ...pipeline.comparison import Comparison, Pair
 
@@ -27,15 +29,9 @@ _FILE = click.Path(dir_okay=False, path_type=Path)
 @click.option("--whole", is_flag=True, help="All that the scintillometers measured, also where there are no batches.")
 @click.option("--csv", "table", type=_FILE, help="Write the values of every window.")
 @click.option("-o", "--output", type=_FILE, help="Figure to write (.svg, .png or .pdf).")
-@click.option("--from", "since", metavar="TIME", help="Batches that start at or after it, as 2012-09-14T14:00Z.")
-@click.option("--to", "until", metavar="TIME", help="Batches that start before it.")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("results"),
-    show_default=True,
-    help="Folder of the catalog.",
-)
+@SINCE
+@UNTIL
+@OUT
 def compare(
     inputs: tuple[str, ...],
     campaign: Path | None,

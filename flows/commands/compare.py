@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from .results import OUT, catalog, existing, find
+from .options import OUT
+from .results import catalog, existing, find
 
 #: Columns of the table of results, each for both products.
 _RESULTS = ("mean Cn2", "r0 (cm)", "scint.", "log mu", "chi2")

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from .options import LINEAGE, OUT, SINCE, UNTIL
+
 if TYPE_CHECKING:
     from ..chosen import Chosen
 
@@ -39,19 +41,13 @@ def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[st
     required=True,
     help="File to write all to, or an existing folder: a file a day then, named by site, quantity and day.",
 )
-@click.option("--from", "since", metavar="TIME", help="Batches that start at or after it, as 2012-09-14T14:00Z.")
-@click.option("--to", "until", metavar="TIME", help="Batches that start before it, as 2012-09-14T18:00+02:00.")
-@click.option("--lineage", metavar="KEY", help="Products of this lineage, by the first digits of its key.")
+@SINCE
+@UNTIL
+@LINEAGE
 @click.option("--cf-strict", is_flag=True, help="NetCDF: leave out units that UDUNITS cannot read.")
 @click.option("--attribute", "attributes", multiple=True, metavar="NAME=TEXT", callback=_attributes,
               help="NetCDF: a global attribute of ACDD, as creator_name, license.")  # fmt: skip
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("results"),
-    show_default=True,
-    help="Folder of the catalog.",
-)
+@OUT
 def export(
     inputs: tuple[str, ...],
     form: str | None,

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .results import OUT, catalog, existing, find
+from .options import OUT
+from .results import catalog, existing, find
 
 if TYPE_CHECKING:
     from ...catalog.rows import Fault

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from .results import OUT
+from .options import OUT, SINCE, UNTIL
 
 
 @click.command()
@@ -36,8 +36,8 @@ from .results import OUT
     help="A table to read, or what other programs read (SI units).",
 )
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write.")
-@click.option("--from", "since", metavar="TIME", help="Batches that start at or after it, as 2012-09-14T14:00Z.")
-@click.option("--to", "until", metavar="TIME", help="Batches that start before it.")
+@SINCE
+@UNTIL
 @OUT
 def link(
     inputs: tuple[str, ...],

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from .results import OUT, catalog, existing
+from .options import OUT
+from .results import catalog, existing
 
 
 def _fields() -> str:

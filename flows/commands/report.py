@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from .options import LINEAGE, OUT, SINCE, UNTIL
+
 _FORMATS = {".html": "html", ".htm": "html", ".pdf": "pdf", ".png": "png"}
 
 
@@ -13,16 +15,10 @@ _FORMATS = {".html": "html", ".htm": "html", ".pdf": "pdf", ".png": "png"}
 @click.argument("inputs", metavar="CAMPAIGN.toml | PRODUCT | FOLDER", nargs=-1, required=True)
 @click.option("-o", "--output", type=click.Path(dir_okay=False, path_type=Path), required=True, help="File to write.")
 @click.option("--format", "form", type=click.Choice(["html", "pdf", "png"]), help="By the ending of FILE if absent.")
-@click.option("--from", "since", metavar="TIME", help="Batches that start at or after it, as 2012-09-14T14:00Z.")
-@click.option("--to", "until", metavar="TIME", help="Batches that start before it, as 2012-09-14T18:00+02:00.")
-@click.option("--lineage", metavar="KEY", help="Products of this lineage, by the first digits of its key.")
-@click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("results"),
-    show_default=True,
-    help="Folder of the catalog.",
-)
+@SINCE
+@UNTIL
+@LINEAGE
+@OUT
 def report(
     inputs: tuple[str, ...],
     output: Path,

@@ -6,13 +6,12 @@ from pathlib import Path
 
 import click
 
+from .options import OUT
+
 
 @click.command()
 @click.argument("product", metavar="KEY")
-@click.option(
-    "--out", type=click.Path(file_okay=False, path_type=Path), default=Path("results"), show_default=True,
-    help="Folder of the catalog.",
-)  # fmt: skip
+@OUT
 @click.option(
     "-o", "--output", type=click.Path(dir_okay=False, path_type=Path), help="File to write instead of printing."
 )

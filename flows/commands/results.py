@@ -7,16 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from .options import OUT
+
 if TYPE_CHECKING:
     from ...catalog.store import Catalog, ProductRow
-
-OUT = click.option(
-    "--out",
-    type=click.Path(file_okay=False, path_type=Path),
-    default=Path("results"),
-    show_default=True,
-    help="Folder of the catalog.",
-)
 
 
 def existing(folder: Path, *, read_only: bool = False) -> Catalog:
