@@ -32,7 +32,7 @@ def _inputs(command: Callable[..., Any]) -> Callable[..., Any]:
             "--out", type=click.Path(file_okay=False, path_type=Path),
             help="Folder of the catalog.  [default: output of the campaign file, or ./results]",
         ),
-        click.argument("inputs", metavar="CAMPAIGN.toml | ARCHIVE...", nargs=-1, required=True),
+        click.argument("inputs", metavar="CAMPAIGN.toml... | ARCHIVE...", nargs=-1, required=True),
     ):  # fmt: skip
         command = decorate(command)
     return command
@@ -44,25 +44,36 @@ def settings_of(
     assignments: tuple[str, ...] = (),
     scheduler: str | None = None,
     **shortcuts: Any,
-) -> Settings:
-    """Settings of a command line: a campaign file, archives, or both."""
+) -> list[Settings]:
+    """Settings of a command line: one for each campaign file, or one for archives with or without a campaign file."""
     from ..settings import InputError, load
 
-    campaigns = [item for item in inputs if item.endswith(".toml")]
+    campaigns = [Path(item) for item in inputs if item.endswith(".toml")]
     archives = [item for item in inputs if not item.endswith(".toml")]
-    if len(campaigns) > 1:
-        raise InputError([f"{len(campaigns)} campaign files are given; process them one after the other"])
+    if len(campaigns) > 1 and archives:
+        raise InputError(
+            [f"{len(campaigns)} campaign files and archives are given; archives go with one campaign file"]
+        )
     extra = [f"response.{key}={value}" for key, value in shortcuts.items() if value is not None]
-    settings = load(
-        Path(campaigns[0]) if campaigns else None,
-        archives=archives,
-        output=out,
-        assignments=[*assignments, *extra],
-        scheduler=scheduler,
-    )
-    if not settings.archives:
-        raise InputError([f"{settings.origin}: archives names none; write archives = ['raw/*.zarr.zip']"])
-    return settings
+    found, faults = [], []
+    for campaign in campaigns or [None]:
+        try:
+            settings = load(
+                campaign,
+                archives=archives,
+                output=out,
+                assignments=[*assignments, *extra],
+                scheduler=scheduler,
+            )
+        except InputError as error:
+            faults += error.faults
+            continue
+        if not settings.archives:
+            faults.append(f"{settings.origin}: archives names none; write archives = ['raw/*.zarr.zip']")
+        found.append(settings)
+    if faults:
+        raise InputError(faults)
+    return found
 
 
 def _chosen(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -96,13 +107,26 @@ def options_of(since: str | None, until: str | None, retry_failed: bool, keep_go
     return Options(retry_failed=retry_failed, keep_going=keep_going, since=times[0], until=times[1])
 
 
-def show_plan(settings: Settings, options: Options) -> None:
+def show_plans(campaigns: list[Settings], options: Options) -> None:
     """Say what a run would reuse, read, compute and write, and how long that may take."""
+    from ..cli import complain
+
+    faults: list[str] = []
+    for settings in campaigns:
+        if len(campaigns) > 1:
+            click.echo(f"{settings.origin}:")
+        faults += _show_plan(settings, options)
+    if faults:
+        complain(faults)
+        raise click.exceptions.Exit(2)
+
+
+def _show_plan(settings: Settings, options: Options) -> list[str]:
+    """The same of one campaign; what is wrong with its archives."""
     from ...catalog.archive import ArchiveError
     from ...catalog.database import is_catalog
     from ...pipeline.units import safe
     from ...plugins.registry import PluginError
-    from ..cli import complain
     from ..estimate import forecast, lines
     from ..plan import plan_archive
     from ..settings import InputError
@@ -125,9 +149,7 @@ def show_plan(settings: Settings, options: Options) -> None:
         click.echo(safe(line))
     if skipped:
         click.echo(f"{skipped} of {len(settings.archives)} archives lie outside the range of time")
-    if faults:
-        complain(faults)
-        raise click.exceptions.Exit(2)
+    return faults
 
 
 @click.command()
@@ -144,8 +166,8 @@ def plan(
     retry_failed: bool,
 ) -> None:
     """Show what a run would reuse, read, compute and write, and about how long that takes; nothing is computed."""
-    settings = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
-    show_plan(settings, options_of(since, until, retry_failed))
+    campaigns = settings_of(inputs, out, assignments, sampling=sampling, slices=slices)
+    show_plans(campaigns, options_of(since, until, retry_failed))
 
 
 @click.command()
@@ -181,29 +203,55 @@ def run(
 ) -> None:
     """Turn recordings into catalogued Cn2 profiles.
 
-    Give a campaign file, raw archives (folders, .zip files, URLs), or both. What the catalog already holds is not
-    computed again; a run that was interrupted goes on where it was. One bad archive or batch does not stop the others.
+    Give campaign files, which are processed one after the other, or raw archives (folders, .zip files, URLs), with or
+    without one campaign file. What the catalog already holds is not computed again; a run that was interrupted goes on
+    where it was. One bad archive or batch does not stop the others.
     """
-    from ..progress import counted, progress
+    from contextlib import ExitStack
 
-    settings = settings_of(inputs, out, assignments, scheduler, sampling=sampling, slices=slices)
+    from .. import logs
+    from ..progress import say
+    from ..server import server
+
+    campaigns = settings_of(inputs, out, assignments, scheduler, sampling=sampling, slices=slices)
     options = options_of(since, until, retry_failed, keep_going)
     if dry_run:
-        show_plan(settings, options)
+        show_plans(campaigns, options)
         return
-    from .. import logs
-    from ..run import run as process
-
     logged = log_json or log_level is not None
-    with logs.shown(log_level, log_json), progress(len(settings.archives), quiet, silent=logged) as watcher:
-        outcomes = process(settings, watcher, prefect=not no_prefect, options=options)
+    worst = 0
+    with ExitStack() as around:
+        around.enter_context(logs.shown(log_level, log_json))
+        if len(campaigns) > 1 and not no_prefect:
+            around.enter_context(server())()
+        for settings in campaigns:
+            if worst and not keep_going:
+                break
+            if len(campaigns) > 1 and not (quiet or logged):
+                say(settings.origin)
+            worst = max(worst, _run_one(settings, options, not no_prefect, quiet, logged))
+    raise click.exceptions.Exit(worst)
+
+
+def _run_one(settings: Settings, options: Options, prefect: bool, quiet: bool, logged: bool) -> int:
+    """Process one campaign and say what became of it; the exit code."""
+    from ..cli import complain
+    from ..progress import counted, progress
+    from ..run import run as process
+    from ..settings import InputError
+
+    try:
+        with progress(len(settings.archives), quiet, silent=logged) as watcher:
+            outcomes = process(settings, watcher, prefect=prefect, options=options)
+    except InputError as error:  # its catalog cannot be used; that of the next one may
+        complain(error.faults)
+        return 2
     published = [outcome for outcome in outcomes if outcome.status in ("published", "present")]
     if not quiet and published:
         verb = "is" if len(published) == 1 else "are"
         click.echo(f"{len(published)} of {counted(len(outcomes), 'archive')} {verb} in {settings.output}")
-        source = inputs[0] if inputs[0].endswith(".toml") else published[0].product
+        source = published[0].product if settings.origin == "command line" else settings.origin
         click.echo(f"Next: coslidar report {source} -o report.html")
     if any(outcome.input_fault for outcome in outcomes):
-        raise click.exceptions.Exit(2)
-    if any(outcome.status == "failed" or outcome.failed_batches for outcome in outcomes):
-        raise click.exceptions.Exit(1)
+        return 2
+    return int(any(outcome.status == "failed" or outcome.failed_batches for outcome in outcomes))

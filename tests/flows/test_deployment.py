@@ -137,6 +137,41 @@ def test_deploy_to_a_work_pool(theirs: str, coslidar: Call, campaigns: list[Path
     assert len(products(campaigns[0].parent / "results")) == 1
 
 
+def test_campaigns_are_processed_one_after_the_other(
+    main_here: Call, campaigns: list[Path], recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path
+) -> None:
+    third = tmp_path / "third"
+    (third / "raw").mkdir(parents=True)
+    shutil.copy(recordings[1], third / "raw")
+    shutil.copy(campaigns[0], third)
+    planned = main_here("run", *campaigns, third / "campaign.toml", "--dry-run")
+    assert planned.code == 2
+    assert [line for line in planned.out.splitlines() if line.endswith(".toml:")] == [
+        f"{path}:" for path in (*campaigns, third / "campaign.toml")
+    ]
+    done = main_here("run", *campaigns, third / "campaign.toml", "--no-prefect")
+    # The bad one is told as such, and stopped nothing.
+    assert done.code == 2
+    assert "none-such.zarr" in done.err
+    assert [line for line in done.err.splitlines() if line.endswith(".toml")] == [
+        f"coslidar: {path}" for path in (*campaigns, third / "campaign.toml")
+    ]
+    made = [products(path.parent / "results") for path in (campaigns[0], third / "campaign.toml")]
+    assert [len(one) for one in made] == [1, 1]
+    assert {**made[0], **made[1]}.items() <= undisturbed.items()
+    # Told not to, it begins no other one; and faults of all files are told before anything begins.
+    stopped = main_here("run", *reversed(campaigns), "--no-prefect", "--no-keep-going", "--out", tmp_path / "none")
+    assert stopped.code == 2
+    assert not products(tmp_path / "none")
+    for path in campaigns:
+        path.write_text("archives = []\n[batch]\nlength = '3 s'\n")
+    wrong = main_here("run", *campaigns, "--no-prefect")
+    assert wrong.code == 2
+    assert [str(path) in line for path, line in zip(campaigns, wrong.err.splitlines(), strict=True)] == [True, True]
+    mixed = main_here("run", *campaigns, recordings[0])
+    assert "archives go with one campaign file" in mixed.err
+
+
 def test_mistakes_in_a_schedule(coslidar: Call, campaigns: list[Path]) -> None:
     for arguments, words in (
         (("serve", campaigns[0], "--every", "10"), "the unit is missing"),
