@@ -13,7 +13,7 @@ from .batch_panels import (
     draw_kernel_sums,
     draw_profile,
 )
-from .page import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, figure, render, write_report
+from .page import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, figure, nothing_to_draw, render, write_report
 from .printed import write_pdf, write_png
 from .style import figure_style
 from .time_panels import (
@@ -44,6 +44,7 @@ __all__ = [
     "draw_time_distance",
     "figure",
     "figure_style",
+    "nothing_to_draw",
     "render",
     "write_pdf",
     "write_png",

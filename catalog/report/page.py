@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...pipeline.products import QUALITY_FLAGS
+from ...pipeline.products import QUALITY_FLAGS, SCHEMA
 from . import batch_panels as one
 from . import check_panels as check
 from . import flux_panels as flux
@@ -22,6 +22,7 @@ from . import model_panels as model
 from . import time_panels as over
 from .reading import (
     LEVELS,
+    Floats,
     bounds,
     edges,
     flag_names,
@@ -85,6 +86,10 @@ class BatchPanel:
         Draws the figure of (figure, dataset, batch).
     describe : callable
         Says what the figure of (dataset, batch) shows.
+    variables : tuple of str
+        The figure says something only where one of them has a value.
+    absent : str
+        Why there is no figure where none has.
     """
 
     key: str
@@ -93,6 +98,8 @@ class BatchPanel:
     size: tuple[float, float]
     compose: Callable[[Figure, Dataset, int], None]
     describe: Callable[[Dataset, int], str]
+    variables: tuple[str, ...]
+    absent: str
 
 
 @dataclass(frozen=True)
@@ -103,8 +110,10 @@ class TimePanel:
     ----------
     key, title, reading, size, compose, describe
         As in :class:`BatchPanel`, for all batches.
-    variables : tuple of str
-        The figure says something only where one of them has a value; always where there are none.
+    variables, absent
+        As in :class:`BatchPanel`; a figure without variables always says something.
+    least : int
+        The figure says something only of so many batches.
     """
 
     key: str
@@ -114,6 +123,8 @@ class TimePanel:
     compose: Callable[[Figure, Sequence[Dataset]], None]
     describe: Callable[[Sequence[Dataset]], str]
     variables: tuple[str, ...] = ()
+    absent: str = ""
+    least: int = 1
 
 
 BATCH_PANELS = (
@@ -128,6 +139,8 @@ BATCH_PANELS = (
         (10.0, 5.0),
         one.compose_profile,
         one.describe_profile,
+        ("cn2",),
+        "This batch has no profile.",
     ),
     BatchPanel(
         "correlations",
@@ -140,6 +153,8 @@ BATCH_PANELS = (
         one.CORRELATION_SIZE,
         one.compose_correlations,
         one.describe_correlations,
+        ("slope_correlation", "intensity_correlation"),
+        "This batch has no correlation maps.",
     ),
     BatchPanel(
         "criterion",
@@ -150,6 +165,8 @@ BATCH_PANELS = (
         (10.0, 3.6),
         one.compose_criterion,
         one.describe_criterion,
+        ("criterion",),
+        "There is no criterion curve: μ was given.",
     ),
     BatchPanel(
         "kernels",
@@ -160,6 +177,8 @@ BATCH_PANELS = (
         (10.0, 4.9),
         one.compose_kernels,
         one.describe_kernels,
+        ("averaging_kernel",),
+        "This batch has no averaging kernels.",
     ),
     BatchPanel(
         "other_mu",
@@ -169,6 +188,8 @@ BATCH_PANELS = (
         (10.0, 3.6),
         model.compose_other_mu,
         model.describe_other_mu,
+        ("cn2_other_mu",),
+        "This batch has no profiles at other μ.",
     ),
     BatchPanel(
         "checks",
@@ -180,6 +201,8 @@ BATCH_PANELS = (
         (10.0, 3.9),
         check.compose_checks,
         check.describe_checks,
+        ("zernike_variance", "log_amplitude_count"),
+        "This batch has no such checks.",
     ),
     BatchPanel(
         "vibration",
@@ -189,6 +212,8 @@ BATCH_PANELS = (
         (10.0, 3.4),
         check.compose_spectrum,
         check.describe_spectrum,
+        ("slope_spectrum",),
+        "This batch has no spectrum of the slopes.",
     ),
 )
 
@@ -203,6 +228,8 @@ TIME_PANELS = (
         over.compose_time_distance,
         over.describe_time_distance,
         ("cn2",),
+        "No batch has a profile.",
+        2,
     ),
     TimePanel(
         "strength",
@@ -215,6 +242,7 @@ TIME_PANELS = (
         over.compose_strength,
         over.describe_strength,
         ("scintillation_index_profile", "scintillation_index_direct", "r0_profile", "r0_direct"),
+        "No batch has these numbers.",
     ),
     TimePanel(
         "fit",
@@ -225,6 +253,7 @@ TIME_PANELS = (
         over.compose_fit,
         over.describe_fit,
         ("chi2_reduced", "mu"),
+        "No batch has these numbers.",
     ),
     TimePanel(
         "selection",
@@ -235,6 +264,7 @@ TIME_PANELS = (
         over.compose_selection,
         over.describe_selection,
         ("criterion",),
+        "There are no criterion curves: μ was given.",
     ),
     TimePanel(
         "averages",
@@ -245,6 +275,7 @@ TIME_PANELS = (
         over.compose_averages,
         over.describe_averages,
         ("cn2_path_mean",),
+        "No batch has a mean along the path.",
     ),
     TimePanel(
         "scintillometers",
@@ -256,6 +287,7 @@ TIME_PANELS = (
         flux.compose_agreement,
         flux.describe_agreement,
         ("cn2_scintillometer",),
+        "No records of a scintillometer stand beside these profiles.",
     ),
     TimePanel(
         "height",
@@ -267,6 +299,7 @@ TIME_PANELS = (
         flux.compose_height_model,
         flux.describe_height_model,
         ("cn2_height_model",),
+        "The height of the line of sight above the ground is not known.",
     ),
     TimePanel(
         "heat_flux",
@@ -277,6 +310,7 @@ TIME_PANELS = (
         flux.compose_heat_flux,
         flux.describe_heat_flux,
         ("sensible_heat_flux",),
+        "No weather is known, from which a heat flux would follow.",
     ),
     TimePanel(
         "weights",
@@ -287,6 +321,7 @@ TIME_PANELS = (
         model.compose_weights,
         model.describe_weights,
         ("scintillometer_weight",),
+        "The recording's header names no scintillometer.",
     ),
     TimePanel(
         "response",
@@ -298,7 +333,8 @@ TIME_PANELS = (
         (10.0, 7.2),
         model.compose_response,
         model.describe_response,
-        ("response_intensity",),
+        ("response_intensity", "response_slope"),
+        "The product holds no response functions.",
     ),
     TimePanel(
         "quality",
@@ -369,10 +405,32 @@ def _draw(panel: BatchPanel | TimePanel, products: Sequence[Dataset], batch: int
     return drawn
 
 
-def says_something(panel: TimePanel, products: Sequence[Dataset]) -> bool:
-    """Whether a panel over time has anything to show."""
-    found = [values(dataset, name) for dataset in products for name in panel.variables]
-    return not panel.variables or any(value is not None and bool(np.isfinite(value).any()) for value in found)
+def nothing_to_draw(panel: BatchPanel | TimePanel, products: Sequence[Dataset], batch: int = 0) -> str:
+    """Why a panel would be empty, in a sentence; no words where it has something to draw.
+
+    Parameters
+    ----------
+    panel : BatchPanel or TimePanel
+        One of :data:`BATCH_PANELS`, :data:`TIME_PANELS`.
+    products : sequence of Dataset
+        Products; a panel of one batch takes the first.
+    batch : int
+        Number of the batch in that product.
+    """
+    if isinstance(panel, BatchPanel):
+        found = {name: [of_batch(products[0], name, batch)] for name in panel.variables}
+    else:
+        if (count := sum(dataset.sizes["time"] for dataset in products)) < panel.least:
+            return f"This takes {panel.least} batches at least; here {'is 1' if count == 1 else f'are {count}'}."
+        found = {name: [values(dataset, name) for dataset in products] for name in panel.variables}
+    drawn = any(_valued(name, value) for name, several in found.items() for value in several)
+    return "" if drawn or not found else panel.absent
+
+
+def _valued(name: str, value: Floats | None) -> bool:
+    # A Cn2 of zero is a value; a count of nothing is none.
+    counted = name in SCHEMA and SCHEMA[name].dtype == "int64"
+    return value is not None and bool((value != 0).any() if counted else np.isfinite(value).any())
 
 
 def _known(panel: TimePanel, products: Sequence[Dataset]) -> bool:
@@ -383,7 +441,7 @@ def _known(panel: TimePanel, products: Sequence[Dataset]) -> bool:
 def _markup(panel: BatchPanel | TimePanel, prefix: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
     text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
     svg = ""
-    if isinstance(panel, BatchPanel) or says_something(panel, products):
+    if not nothing_to_draw(panel, products, batch):
         with figure_style():
             svg = inline_svg(_draw(panel, products, batch), prefix, panel.title, text)
     return {"title": panel.title, "reading": panel.reading, "text": text, "svg": svg, "key": panel.key}
@@ -701,11 +759,10 @@ def render(
             "rows": one.profile_rows(products[i], j),
         })  # fmt: skip
 
-    several = len(batches) > 1
     panels = [
         _markup(panel, f"t{panel.key}", products)
         for panel in TIME_PANELS
-        if _known(panel, products) and (panel.key != "map" or (several and says_something(panel, products)))
+        if _known(panel, products) and (panel.least == 1 or not nothing_to_draw(panel, products))
     ]
     documents = _documents(products)
     environment = Environment(

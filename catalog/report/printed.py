@@ -27,7 +27,7 @@ def _panels(products: Sequence[Dataset], most_batches: int) -> Iterator[tuple[st
     import numpy as np
 
     for panel in page.TIME_PANELS:
-        if page.says_something(panel, products):
+        if not page.nothing_to_draw(panel, products):
             drawn = page.figure(panel, products)
             yield panel.key, panel.title, f"{panel.describe(products)} {panel.reading}", drawn
     batches = [(dataset, i) for dataset in products for i in range(dataset.sizes["time"])]
@@ -36,6 +36,8 @@ def _panels(products: Sequence[Dataset], most_batches: int) -> Iterator[tuple[st
         start, stop = (int(time) for time in bounds(dataset)[i])
         which = f"{' to '.join(interval(start, stop))} UTC, {LEVELS[levels(dataset)[i]]}"
         for one in page.BATCH_PANELS:
+            if page.nothing_to_draw(one, [dataset], i):
+                continue
             name = one.key if len(shown) == 1 else f"{one.key}-{number + 1}"
             words = f"{which}. {one.describe(dataset, i)} {one.reading}"
             yield name, one.title, words, page.figure(one, dataset, i)

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import tempfile
-import threading
 import zipfile
-from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -26,13 +24,13 @@ from starlette.routing import Route
 from ...catalog import export
 from ...catalog.database import DatabaseError
 from ...catalog.products import ProductError
-from ...catalog.report import BATCH_PANELS, TIME_PANELS, render
+from ...catalog.report import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, nothing_to_draw, render
 from ...catalog.report.batch_panels import profile_rows
 from ...catalog.report.reading import LEVELS, bounds, flag_names, flags, levels
 from ...catalog.report.two_lineages import differences, slice_rows, summary_rows, two_profiles_markup
 from ...catalog.report.words import clean, clock, interval, mapping, number, raised_units
 from ...catalog.store import CatalogError
-from .panels import FORMATS, PANELS, Dataset, Drawn, figure_bytes, panel_markup
+from .panels import FORMATS, PANELS, PEN, Dataset, Kept, Offer, figure_bytes, panel_markup
 
 if TYPE_CHECKING:
     from starlette.requests import Request
@@ -41,8 +39,8 @@ if TYPE_CHECKING:
 
 #: Rows of a table on one page.
 ROWS = 200
-#: Products that are kept in memory.
-_OPEN = 16
+#: Products that are kept in memory, and pages.
+_OPEN, _SHOWN = 16, 64
 
 
 class Refusal(Exception):
@@ -137,9 +135,9 @@ class Pages:
     def __init__(self, catalog: Catalog, name: str) -> None:
         self.catalog = catalog
         self.name = name
-        self._products: OrderedDict[tuple[int, str], Dataset] = OrderedDict()
-        self._reading = threading.Lock()
-        self._drawn = Drawn()
+        self._products: Kept[Dataset] = Kept(_OPEN)
+        self._drawn: Kept[dict[str, str]] = Kept(_SHOWN, PEN)
+        self._offers: Kept[Offer] = Kept(_SHOWN)
         self._templates = Environment(
             loader=FunctionLoader(_text), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
             lstrip_blocks=True,
@@ -191,19 +189,16 @@ class Pages:
         raise Refusal(404, f"the catalog has no product {number}")
 
     def _dataset(self, row: ProductRow) -> Dataset:
-        key = (row.id, row.sha256)
-        with self._reading:
-            if key not in self._products:
-                self._products[key] = self.catalog.open(row)
-                while len(self._products) > _OPEN:
-                    self._products.popitem(last=False)
-            self._products.move_to_end(key)
-            return self._products[key]
+        return self._products.get((row.id, row.sha256), lambda: self.catalog.open(row))
 
     def _panel(self, key: str, rows: Sequence[ProductRow], batch: int = 0) -> dict[str, str]:
         name = (key, batch, tuple((row.id, row.sha256) for row in rows))
         products = [self._dataset(row) for row in rows]
         return self._drawn.get(name, lambda: panel_markup(key, products, batch))
+
+    def _offer(self, kind: Sequence[BatchPanel | TimePanel], rows: Sequence[ProductRow], batch: int = 0) -> Offer:
+        name = (kind is BATCH_PANELS, batch, tuple((row.id, row.sha256) for row in rows))
+        return self._offers.get(name, lambda: Offer.of(kind, [self._dataset(row) for row in rows], batch))
 
     # --- pages ---------------------------------------------------------------------------------------------
 
@@ -262,14 +257,15 @@ class Pages:
             raise Refusal(404, f"the catalog has no campaign '{name}'")
         newest = {row.archive_identity: row for row in sorted(rows, key=lambda row: (row.published, row.id))}
         chosen = sorted(newest.values(), key=lambda row: row.start)
-        key = _one_of(request.query_params.get("panel", TIME_PANELS[0].key), [panel.key for panel in TIME_PANELS])
+        offer = self._offer(TIME_PANELS, chosen)
+        key = _panel_key(request, offer, TIME_PANELS)
         return self._page(
             "campaign.html",
             title=name,
             name=name,
             rows=chosen,
             others=len(rows) - len(chosen),
-            panels=TIME_PANELS,
+            offer=offer,
             panel=self._panel(key, chosen),
         )
 
@@ -277,14 +273,15 @@ class Pages:
         """One product: what it is, its panels over time, its batches, what it can be compared with."""
         row = self._row(request.path_params["product"])
         dataset = self._dataset(row)
-        key = _one_of(request.query_params.get("panel", TIME_PANELS[0].key), [panel.key for panel in TIME_PANELS])
+        offer = self._offer(TIME_PANELS, [row])
+        key = _panel_key(request, offer, TIME_PANELS)
         limit, level, raised = bounds(dataset), levels(dataset), flags(dataset)
         return self._page(
             "product.html",
             title=row.name,
             row=row,
             period=interval(row.start, row.stop),
-            panels=TIME_PANELS,
+            offer=offer,
             panel=self._panel(key, [row]),
             formats=list(FORMATS),
             batches=[
@@ -310,7 +307,8 @@ class Pages:
         if n >= row.batches:
             raise Refusal(404, f"{row.name} has {row.batches} batches; there is no number {n}")
         dataset = self._dataset(row)
-        key = _one_of(request.query_params.get("panel", BATCH_PANELS[0].key), [panel.key for panel in BATCH_PANELS])
+        offer = self._offer(BATCH_PANELS, [row], n)
+        key = _panel_key(request, offer, BATCH_PANELS)
         start, stop = (int(time) for time in bounds(dataset)[n])
         return self._page(
             "batch.html",
@@ -320,7 +318,7 @@ class Pages:
             period=interval(start, stop),
             level=int(levels(dataset)[n]),
             flags=flag_names(int(flags(dataset)[n])),
-            panels=BATCH_PANELS,
+            offer=offer,
             panel=self._panel(key, [row], n),
             formats=list(FORMATS),
             rows=profile_rows(dataset, n) if key == BATCH_PANELS[0].key else [],
@@ -373,7 +371,10 @@ class Pages:
         n = _whole(request.query_params.get("batch", "0"), "batch")
         if n >= row.batches:
             raise Refusal(404, f"{row.name} has {row.batches} batches; there is no number {n}")
-        content = figure_bytes(key, [self._dataset(row)], n, form)
+        dataset = self._dataset(row)
+        if reason := nothing_to_draw(PANELS[key], [dataset], n):
+            raise Refusal(404, f"'{PANELS[key].title}' has nothing to draw here: {reason}")
+        content = figure_bytes(key, [dataset], n, form)
         which = f".{n}" if PANELS[key] in BATCH_PANELS else ""
         return _attachment(content, FORMATS[form], f"{row.archive}.{row.lineage_key[:16]}{which}.{key}.{form}")
 
@@ -456,6 +457,12 @@ def _one_of(text: str, known: Sequence[str] | Mapping[str, Any]) -> str:
     if text not in known:
         raise Refusal(404, f"there is no '{text[:40]}' here; there are {', '.join(known)}")
     return text
+
+
+def _panel_key(request: Request, offer: Offer, kind: Sequence[BatchPanel | TimePanel]) -> str:
+    """The panel asked for, be it empty; else the first one that is not."""
+    first = (offer.panels or kind)[0].key
+    return _one_of(request.query_params.get("panel", first), [panel.key for panel in kind])
 
 
 def _attachment(content: bytes, media_type: str, name: str) -> Response:

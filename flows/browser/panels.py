@@ -6,34 +6,42 @@ import io
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from dataclasses import dataclass
+from typing import Any, Generic, TypeAlias, TypeVar
 
-import numpy as np
-
-from ...catalog.report import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, figure, figure_style
-from ...catalog.report.reading import values
+from ...catalog.report import BATCH_PANELS, TIME_PANELS, BatchPanel, TimePanel, figure, figure_style, nothing_to_draw
 from ...catalog.report.svg import inline_svg
 
 #: An xarray Dataset; only the catalog imports xarray.
 Dataset: TypeAlias = Any
+T = TypeVar("T")
 #: Formats of a figure that can be downloaded -> media type.
 FORMATS = {"svg": "image/svg+xml", "png": "image/png", "pdf": "application/pdf"}
 PANELS: dict[str, BatchPanel | TimePanel] = {panel.key: panel for panel in (*TIME_PANELS, *BATCH_PANELS)}
 
 # Matplotlib's settings belong to the process.
-_PEN = threading.Lock()
+PEN = threading.Lock()
 
 
-class Drawn:
-    """Markup of panels that were drawn before: leafing back costs nothing."""
+class Kept(Generic[T]):
+    """Things that were made before: leafing back costs nothing.
 
-    def __init__(self, most: int = 64) -> None:
-        self._kept: OrderedDict[object, dict[str, str]] = OrderedDict()
+    Parameters
+    ----------
+    most : int
+        How many; those not asked for longest go first.
+    lock : Lock, optional
+        Held while one is made.
+    """
+
+    def __init__(self, most: int, lock: threading.Lock | None = None) -> None:
+        self._kept: OrderedDict[object, T] = OrderedDict()
         self._most = most
+        self._lock = lock or threading.Lock()
 
-    def get(self, key: object, make: Callable[[], dict[str, str]]) -> dict[str, str]:
+    def get(self, key: object, make: Callable[[], T]) -> T:
         """What `make` gives, made once as long as it is not pushed out."""
-        with _PEN:
+        with self._lock:
             if key not in self._kept:
                 self._kept[key] = make()
                 while len(self._kept) > self._most:
@@ -42,10 +50,29 @@ class Drawn:
             return self._kept[key]
 
 
-def _empty(panel: BatchPanel | TimePanel, products: Sequence[Dataset]) -> bool:
-    names: Sequence[str] = getattr(panel, "variables", ())
-    found = [values(dataset, name) for dataset in products for name in names]
-    return bool(names) and not any(value is not None and bool(np.isfinite(value).any()) for value in found)
+@dataclass(frozen=True)
+class Offer:
+    """Panels that a page has to offer.
+
+    Parameters
+    ----------
+    panels : list of BatchPanel or TimePanel
+        Those that have something to draw.
+    absent : list of (str, str)
+        Titles of the others, and why they are none.
+    """
+
+    panels: list[BatchPanel | TimePanel]
+    absent: list[tuple[str, str]]
+
+    @classmethod
+    def of(cls, kind: Sequence[BatchPanel | TimePanel], products: Sequence[Dataset], batch: int = 0) -> Offer:
+        """What of a kind of panels products, or one batch of the first, have to offer."""
+        why = {panel.key: nothing_to_draw(panel, products, batch) for panel in kind}
+        return cls(
+            [panel for panel in kind if not why[panel.key]],
+            [(panel.title, why[panel.key]) for panel in kind if why[panel.key]],
+        )
 
 
 def panel_markup(key: str, products: Sequence[Dataset], batch: int = 0) -> dict[str, str]:
@@ -53,7 +80,9 @@ def panel_markup(key: str, products: Sequence[Dataset], batch: int = 0) -> dict[
     panel = PANELS[key]
     text = panel.describe(products[0], batch) if isinstance(panel, BatchPanel) else panel.describe(products)
     drawn = ""
-    if not _empty(panel, products):
+    if reason := nothing_to_draw(panel, products, batch):
+        text = reason
+    else:
         with figure_style():
             drawn = inline_svg(figure(panel, products, batch), f"p-{key}", panel.title, text)
     return {"key": key, "title": panel.title, "reading": panel.reading, "text": text, "svg": drawn}
@@ -62,7 +91,7 @@ def panel_markup(key: str, products: Sequence[Dataset], batch: int = 0) -> dict[
 def figure_bytes(key: str, products: Sequence[Dataset], batch: int, form: str) -> bytes:
     """A panel as a file of one of :data:`FORMATS`."""
     out = io.BytesIO()
-    with _PEN, figure_style():
+    with PEN, figure_style():
         # Transparent figures cannot be read on the dark background of a viewer.
         figure(PANELS[key], products, batch).savefig(out, format=form, facecolor="white")
     return out.getvalue()

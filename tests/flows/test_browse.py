@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import re
 import shutil
@@ -10,10 +11,12 @@ import sqlite3
 import subprocess
 import zipfile
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import httpx
+import made_products
 import numpy as np
 import pytest
 from browsing import HOSTILE, HOSTILE_NAME, Server, hostile_catalog
@@ -23,6 +26,9 @@ from coslidar.catalog import open_catalog
 from coslidar.catalog.products import open_product
 from coslidar.catalog.report import BATCH_PANELS, TIME_PANELS
 from coslidar.catalog.store import Catalog
+from coslidar.flows.browser.pages import Pages
+
+titles = {panel.key: panel.title for panel in (*BATCH_PANELS, *TIME_PANELS)}
 
 
 class Seen(HTMLParser):
@@ -113,6 +119,52 @@ def test_every_panel_is_drawn(server: Server) -> None:
         assert page.panels == [panel.key]
         assert page.pictures == 1
         assert page.paths > 5, panel.key
+
+
+def test_panels_that_would_be_empty_are_not_offered(tmp_path: Path) -> None:
+    """A batch with a profile and little else, and one that failed."""
+    whole = made_products.batch()
+    kept = {"cn2", "cn2_standard_error", "slope_correlation", "log_amplitude_count", "r0_profile"}
+    poor = replace(whole, values={name: value for name, value in whole.values.items() if name in kept})
+    poor.values["log_amplitude_count"][:] = 0
+    with Catalog(tmp_path) as catalog:
+        run = catalog.start_run(command="coslidar run")
+        catalog.publish(made_products.product(results=[poor, made_products.failed(1)]), run)
+        app = Pages(catalog, "here").app()
+
+        async def ask(path: str) -> httpx.Response:
+            async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://here") as client:
+                return await client.get(path)
+
+        def offered(path: str) -> tuple[list[str], str, str]:
+            text = asyncio.run(ask(path)).text
+            nav = text[text.index('<nav class="panels"') : text.index("</nav>", text.index('<nav class="panels"'))]
+            absent = re.search(r'<details class="absent">.*?</details>', text, re.DOTALL)
+            return re.findall(r"panel=(\w+)", nav), absent[0] if absent else "", text
+
+        panels, absent, text = offered("/product/1/batch/0")
+        assert panels == ["profile", "correlations"]
+        assert "5 more panels have nothing to draw here" in absent
+        assert f"{titles['criterion']} <small>There is no criterion curve: μ was given.</small>" in absent
+        assert f"{titles['checks']} <small>This batch has no such checks.</small>" in absent
+        assert 'figure/profile.svg?batch=0"' in text
+
+        panels, absent, text = offered("/product/1/batch/1")
+        assert panels == []
+        assert "7 more panels have nothing to draw here" in absent
+        assert "This batch has no profile." in text
+        assert "<svg" not in text
+        assert "/figure/" not in text
+        answer = asyncio.run(ask("/product/1/figure/profile.svg?batch=1"))
+        assert answer.status_code == 404
+        assert "has nothing to draw here: This batch has no profile." in answer.text.replace("&#39;", "'")
+
+        panels, absent, text = offered("/product/1")
+        assert panels == ["map", "strength", "weights", "response", "quality"]
+        assert f"{titles['heat_flux']} <small>" in absent
+        # An address that names an empty panel, as the link to the next batch may, is answered.
+        panels, absent, text = offered("/product/1?panel=averages")
+        assert "No batch has a mean along the path." in text[text.index("<figure") :]
 
 
 def test_numbers_are_those_of_the_catalog(server: Server, folder: Path) -> None:
