@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..catalog.store import Catalog
-    from .driver import Options
+    from .options import Options
     from .plan import ArchivePlan, BatchWindow
     from .settings import Settings
 

@@ -1,4 +1,7 @@
-"""A run: the catalog opened, the cluster connected, the run recorded, and its end told."""
+"""A run: the catalog opened, the cluster connected, the run recorded, and its end told.
+
+What is slow to import is imported where it is used: a Prefect server takes longest, and starts before that.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +12,14 @@ import sys
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from threadpoolctl import threadpool_limits
-
 from . import logs
-from .cluster import connect
-from .driver import ArchiveOutcome, Options, Progress, Work, execute, in_threads
-from .pulse import Pulse
 from .settings import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from .driver import ArchiveOutcome, Progress, Work
+    from .options import Options
     from .settings import Settings
 
 
@@ -82,8 +82,14 @@ def session(settings: Settings, progress: Progress | None = None, options: Optio
     Unavailable
         The cluster cannot be used.
     """
+    from threadpoolctl import threadpool_limits
+
     from ..catalog.database import DatabaseError
     from ..catalog.store import Catalog, CatalogError
+    from .cluster import connect
+    from .driver import Work
+    from .options import Options
+    from .pulse import Pulse
 
     try:
         opened = Catalog(settings.output)
@@ -135,13 +141,15 @@ def run(
         The cluster or the Prefect server cannot be used.
     """
     if not prefect:
+        from .driver import execute, in_threads
+
         with session(settings, progress, options) as work:
             return execute(work, settings.archives, in_threads)
     from .server import server
 
-    # The server starts while catalog and workers do.
+    # The server starts while everything else is imported, and catalog and workers are opened.
     with server() as ready, session(settings, progress, options) as work:
-        ready()
         from .campaign import processing_flow
 
+        ready()
         return processing_flow(settings, work)

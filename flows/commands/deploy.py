@@ -62,7 +62,7 @@ def serve(campaigns: tuple[Path, ...], every: str, name: str) -> None:
     from ..server import server
 
     seconds = _seconds(every)
-    with server() as ready:
+    with server(schedules=True) as ready:
         url = ready()
         made = deployment(campaigns, name, seconds)
         when = "started by hand" if seconds is None else f"every {every}"

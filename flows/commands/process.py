@@ -10,7 +10,7 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ..driver import Options
+    from ..options import Options
     from ..settings import Settings
 
 
@@ -56,7 +56,8 @@ def settings_of(
         )
     extra = [f"response.{key}={value}" for key, value in shortcuts.items() if value is not None]
     found, faults = [], []
-    for campaign in campaigns or [None]:
+    files: list[Path | None] = [*campaigns] or [None]
+    for campaign in files:
         try:
             settings = load(
                 campaign,
@@ -90,7 +91,7 @@ def _chosen(command: Callable[..., Any]) -> Callable[..., Any]:
 def options_of(since: str | None, until: str | None, retry_failed: bool, keep_going: bool = True) -> Options:
     """Options of a command line."""
     from ...catalog.query_times import TimeError, moment
-    from ..driver import Options
+    from ..options import Options
     from ..settings import InputError
 
     times: list[int | None] = []

@@ -33,10 +33,10 @@ OWNERS = {
     "matplotlib": ("catalog/report/",),
     "jinja2": ("catalog/report/", "flows/browser/"),
     "starlette": ("flows/browser/",),
-    "uvicorn": ("flows/browser/",),
+    "uvicorn": ("flows/browser/", "flows/server.py"),
 }
 #: Prefect is wired in one module, with its pages and its schedules beside it; the driver knows nothing of it.
-PREFECT = {"flows/campaign.py", "flows/artifacts.py", "flows/deployment.py"}
+PREFECT = {"flows/campaign.py", "flows/artifacts.py", "flows/deployment.py", "flows/server.py"}
 
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 

@@ -20,7 +20,7 @@ from coslidar.catalog import heartbeats, open_catalog
 from coslidar.catalog.store import RunRow
 from coslidar.flows import batches, tasks
 from coslidar.flows.batches import Workers
-from coslidar.flows.driver import Options
+from coslidar.flows.options import Options
 from coslidar.flows.plan import plan_archive
 from coslidar.flows.pulse import Pulse
 from coslidar.flows.run import Silent, run

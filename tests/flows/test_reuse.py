@@ -17,7 +17,8 @@ from coslidar.catalog import open_catalog, open_product
 from coslidar.catalog.measurements import MeasurementStore
 from coslidar.catalog.products import fingerprint
 from coslidar.flows import estimate
-from coslidar.flows.driver import ArchiveOutcome, Options
+from coslidar.flows.driver import ArchiveOutcome
+from coslidar.flows.options import Options
 from coslidar.flows.plan import plan_archive
 from coslidar.flows.run import run
 from coslidar.flows.settings import InputError, Settings, load

@@ -16,7 +16,7 @@ from small_runs import BATCHES, FRAMES, SETTINGS, Finished, environment, product
 
 from coslidar.catalog import open_catalog
 from coslidar.flows import tasks
-from coslidar.flows.driver import Options
+from coslidar.flows.options import Options
 from coslidar.flows.run import run
 from coslidar.flows.settings import load
 from coslidar.pipeline.products import QUALITY_FLAGS
