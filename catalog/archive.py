@@ -32,7 +32,7 @@ from .archive_codecs import (
     find_chunks,
     parse_array,
 )
-from .archive_stores import Store, StoreError, open_store, shown
+from .archive_stores import Store, StoreError, UnreachableStore, open_store, shown
 
 #: Data types of frames.
 FRAME_DTYPES = ("uint8", "uint16", "int16", "float32")
@@ -68,12 +68,15 @@ class ArchiveError(ValueError):
         The archive, as the user named it.
     faults : list of str
         All that is wrong: one sentence each, naming archive, key, what was found and what to do.
+    transient : bool
+        Whether a network or server failed rather than the archive, so that another try may succeed.
     """
 
-    def __init__(self, origin: str, faults: list[str]) -> None:
-        super().__init__(origin, faults)
+    def __init__(self, origin: str, faults: list[str], transient: bool = False) -> None:
+        super().__init__(origin, faults, transient)
         self.origin = origin
         self.faults = faults
+        self.transient = transient
 
     def __str__(self) -> str:
         return "\n".join(self.faults)
@@ -124,6 +127,8 @@ class Faults:
     def __init__(self, origin: str) -> None:
         self.origin = origin
         self.sentences: list[str] = []
+        #: How many of them say only that something could not be reached.
+        self.unreachable = 0
 
     def __call__(self, key: str, found: Any, message: str) -> None:
         """Add ``<origin>: <key> = <found>: <message>``."""
@@ -144,10 +149,11 @@ class Faults:
         """
         if not self.sentences:
             return
+        transient = self.unreachable == len(self.sentences)
         kept = list(dict.fromkeys(self.sentences))
         if len(kept) > _MAX_FAULTS:
             kept = [*kept[:_MAX_FAULTS], f"{self.origin}: and {len(kept) - _MAX_FAULTS} more"]
-        raise ArchiveError(self.origin, kept)
+        raise ArchiveError(self.origin, kept, transient)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +359,7 @@ def open_archive(
         return _Opening(url, store, attributes, fault, allow_missing).archive()
     except StoreError as error:
         fault.say(str(error))
+        fault.unreachable += isinstance(error, UnreachableStore)
     except OSError as error:
         fault.say(f"cannot be read ({type(error).__name__}: {error}); check the path and its permissions")
     fault.raise_any()
@@ -548,6 +555,7 @@ class _Opening:
             return array.whole(lambda key, error: ChunkError.of(self.fault.origin, key, error))
         except ChunkError as error:
             self.fault.sentences.append(str(error))
+            self.fault.unreachable += error.transient
             return None
 
 

@@ -22,6 +22,16 @@ from urllib.parse import urlsplit
 _LOCAL_HEADER = struct.Struct("<4s5H3I2H")
 #: Extra field that a remote read allows for, so that one request fetches header and data.
 _USUAL_EXTRA = 64
+#: Exceptions of aiohttp and botocore for a network that fails, which are no OSError.
+_NETWORK = frozenset(
+    (
+        "ServerDisconnectedError",
+        "ClientPayloadError",
+        "EndpointConnectionError",
+        "ConnectTimeoutError",
+        "ReadTimeoutError",
+    )
+)
 #: Requests in flight where a server cannot list and each key is asked for.
 _CONCURRENT_REQUESTS = 16
 
@@ -126,7 +136,7 @@ class RemoteStore:
         except FileNotFoundError:
             listed = {}
         except Exception as error:
-            raise StoreError(f"{prefix} cannot be listed ({_said(error)})") from error
+            raise _failure(error)(f"{prefix} cannot be listed ({_said(error)})") from error
         found = {path.removeprefix(f"{root}/"): entry.get("size") for path, entry in listed.items()}
         yield from (found.get(key) for key in keys)
 
@@ -245,7 +255,7 @@ def open_store(url: str) -> Store:
     except StoreError:
         raise
     except Exception as error:
-        raise StoreError(
+        raise _failure(error)(
             f"the zip file cannot be read where it is ({_said(error)}); its server may not support byte "
             "ranges: download it and open the copy"
         ) from error
@@ -315,13 +325,25 @@ def _absent(fs: Any, error: BaseException) -> bool:
     return not _is_http(fs) or getattr(error.__cause__, "status", None) in (403, 404, 410)
 
 
+def _failure(error: BaseException) -> type[StoreError]:
+    """What an exception of a remote file system amounts to: a network or server that may be back soon, or not."""
+    status = getattr(error, "status", None)
+    if isinstance(status, int):
+        return UnreachableStore if status in (408, 429) or status >= 500 else StoreError
+    # Names that nobody has, and places that want to know who we are, are no better in a second.
+    lasting = isinstance(error, (PermissionError, FileNotFoundError)) or "NONAME" in str(error)
+    network = isinstance(error, (OSError, TimeoutError)) or type(error).__name__ in _NETWORK
+    return UnreachableStore if network and not lasting else StoreError
+
+
 def _remote_size(fs: Any, path: str) -> int | None:
     try:
         entry = fs.info(path)
     except Exception as error:
         if _absent(fs, error):
             return None
-        raise StoreError(f"the server does not answer as it should ({_said(error.__cause__ or error)})") from error
+        cause = error.__cause__ or error
+        raise _failure(cause)(f"the server does not answer as it should ({_said(cause)})") from error
     if entry.get("type") == "directory":
         return None
     if entry.get("size") is None:

@@ -208,7 +208,10 @@ class Database:
         self.url = database_url(url) if isinstance(url, str) else url
         self.is_sqlite = self.url.get_backend_name() == "sqlite"
         self.name = safe(self.url.render_as_string(hide_password=True))
-        options: dict[str, Any] = {"connect_args": {"timeout": BUSY_TIMEOUT}} if self.is_sqlite else {}
+        # A server that was started anew has forgotten our connections.
+        options: dict[str, Any] = (
+            {"connect_args": {"timeout": BUSY_TIMEOUT}} if self.is_sqlite else {"pool_pre_ping": True}
+        )
         try:
             self.engine: Engine = sa.create_engine(self.url, **options)
         except (ImportError, sa.exc.ArgumentError) as error:
@@ -373,6 +376,15 @@ class Database:
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
+
+
+def passing(error: Exception) -> bool:
+    """Whether a database server was lost, so that another try may find it again; a file is not lost like that."""
+    return (
+        isinstance(error, sa.exc.DBAPIError)
+        and (isinstance(error, sa.exc.OperationalError) or error.connection_invalidated)
+        and not isinstance(error.orig, sqlite3.Error)
+    )
 
 
 def number(value: Any) -> float | None:

@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State
-from prefect.exceptions import TerminationSignal
-from prefect.states import Completed, Failed
+from prefect.exceptions import CancelledRun, TerminationSignal
+from prefect.states import Cancelled, Completed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
 from prefect.utilities.annotations import unmapped
 
 from .artifacts import ProgressTable, link_report
-from .driver import ArchiveOutcome, Work, execute, process_archive
+from .cancelling import Cancellation
+from .driver import ArchiveOutcome, Stopped, Work, execute, process_archive
 from .run import session
 from .settings import InputError, Settings, Unavailable, load
 
@@ -34,6 +35,8 @@ def archive_task(url: str, work: Work) -> State[ArchiveOutcome]:
     words = f"{outcome.status}: {outcome.batches - outcome.failed_batches} of {outcome.batches} batches"
     if outcome.status in ("refused", "failed"):
         return Failed(message="; ".join(outcome.faults)[:2000], data=outcome)
+    if outcome.status == "cancelled":
+        return Cancelled(message=words, data=outcome)
     return Completed(message=words, data=outcome)
 
 
@@ -77,14 +80,17 @@ def processing_flow(settings: Settings, work: Work) -> list[ArchiveOutcome]:
         validate_parameters=False,
         persist_result=False,
     )
-    def campaign() -> list[ArchiveOutcome]:
-        with ProgressTable(work.progress, "progress"):
-            return execute(work, settings.archives, in_tasks)
+    def campaign() -> list[ArchiveOutcome] | State[None]:
+        with ProgressTable(work.progress, "progress"), Cancellation(work):
+            try:
+                return execute(work, settings.archives, in_tasks)
+            except Stopped:
+                return Cancelled(message="cancelled; what was finished is kept")
 
     try:
-        return campaign()
-    except TerminationSignal as error:
-        # Prefect's name for SIGTERM while a flow runs.
+        return campaign()  # type: ignore[return-value]
+    except (TerminationSignal, CancelledRun) as error:
+        # Prefect's names for SIGTERM while a flow runs, and for a flow run that was cancelled on its server.
         raise KeyboardInterrupt from error
 
 

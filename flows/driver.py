@@ -16,6 +16,7 @@ from threading import Event, Lock
 from typing import TYPE_CHECKING, Any, Protocol
 
 from ..catalog.archive import ArchiveError
+from ..catalog.database import passing
 from ..catalog.kept import Kept
 from ..catalog.products import assemble
 from ..pipeline import batch as stages
@@ -26,6 +27,7 @@ from . import logs
 from .batches import FAILED, PATIENCE, Batches, Workers
 from .caches import cache_folder
 from .options import Options
+from .patience import patiently, unreachable
 from .plan import ArchivePlan, plan_archive
 from .settings import InputError, Unavailable
 from .tasks import Origin, remember
@@ -87,6 +89,8 @@ class ArchiveOutcome:
         Whether the fault lies in the data (exit code 2) rather than in the run.
     note : str
         Why it was skipped.
+    transient : bool
+        Whether it could not be reached, so that another run may find it whole.
     """
 
     url: str
@@ -100,6 +104,7 @@ class ArchiveOutcome:
     product: str = ""
     input_fault: bool = False
     note: str = ""
+    transient: bool = False
 
 
 @dataclass(eq=False)
@@ -259,7 +264,8 @@ def process_archive(url: str, work: Work) -> ArchiveOutcome:
             for fault in outcome.faults:
                 log.error("%s", fault)
                 if not outcome.batches:  # those of its batches were recorded as they came
-                    work.catalog.record_failure(work.run, url, fault)
+                    reason = f"transient: {fault}" if outcome.transient else fault
+                    work.catalog.record_failure(work.run, url, reason)
         log.info(
             "archive %s: %d of %d batches", outcome.status, outcome.batches - outcome.failed_batches, outcome.batches
         )
@@ -278,8 +284,11 @@ def _outcome(url: str, work: Work) -> ArchiveOutcome:
         if not work.options.wants(plan):
             return ArchiveOutcome(url, name, "skipped", note="outside the range of time")
         with logs.about(archive=name):
-            return _process(plan, work)
+            # What was computed is kept, so another try goes on where the database was lost.
+            return patiently(lambda: _process(plan, work), passing)
     except (ArchiveError, InputError, PluginError) as error:
+        if unreachable(error):
+            return ArchiveOutcome(url, name, "failed", faults=tuple(error.faults), transient=True)
         return ArchiveOutcome(url, name, "refused", faults=tuple(error.faults), input_fault=True)
     except Stopped:
         return ArchiveOutcome(url, name, "cancelled")
@@ -410,10 +419,17 @@ def execute(work: Work, archives: Iterable[str], fan_out: Callable[..., list[Arc
     -------
     list of ArchiveOutcome
         In the order of `archives`.
+
+    Raises
+    ------
+    Stopped
+        The run was told to stop.
     """
     outcomes = fan_out(process_archive, list(archives), work)
+    if work.stopping.is_set():
+        raise Stopped
     complete = all(outcome.status in ("published", "present", "skipped") for outcome in outcomes)
-    work.catalog.finish_run(work.run, "finished" if complete else "failed")
+    patiently(lambda: work.catalog.finish_run(work.run, "finished" if complete else "failed"), passing)
     return outcomes
 
 

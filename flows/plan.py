@@ -13,6 +13,7 @@ from ..pipeline import description
 from ..pipeline.lineage import Key, checkout, make_key
 from ..pipeline.parameters import SOURCES_USED
 from ..pipeline.units import safe
+from .patience import patiently, unreachable
 from .settings import InputError
 from .surroundings import surroundings_of, with_heights
 
@@ -182,7 +183,7 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         Archive and settings do not fit each other.
     """
     # A missing chunk spoils its batch only; `inspect` calls it a fault.
-    archive = open_archive(url, complete=settings.header, allow_missing=True)
+    archive = patiently(lambda: open_archive(url, complete=settings.header, allow_missing=True), unreachable)
     header = archive.header
     origin = safe(url)
     if settings.campaign is not None and header.campaign != settings.campaign:

@@ -20,7 +20,7 @@ from ..pipeline import batch as stages
 from ..pipeline.extraction import Calibration
 from ..pipeline.units import safe
 from ..plugins.registry import KINDS
-from . import logs
+from . import logs, patience
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("coslidar")
 
-#: How long to wait before each new try to read from a network that failed, s.
-PAUSES = (0.5, 2.0, 8.0)
 #: Archives that a worker keeps open.
 MAX_OPEN = 8
 
@@ -190,7 +188,9 @@ def _archive(url: str, identity: str, complete: dict[str, Any]) -> Archive:
         archive = _open.get(identity)
         if archive is None:
             # As the plan opened it: what is missing spoils its batch only.
-            archive = open_archive(url, complete=complete, allow_missing=True)
+            archive = patience.patiently(
+                lambda: open_archive(url, complete=complete, allow_missing=True), patience.unreachable
+            )
             if archive.identity != identity:
                 raise ArchiveChanged(f"{url} has changed since the run was planned; start the run again")
             _keep_open(archive)
@@ -360,10 +360,10 @@ def frames(archive: Archive, start: int, stop: int) -> Iterator[NDArray[Any]]:
                 yield block
                 start, tries = first + len(block), 0
         except ChunkError as error:
-            if not error.transient or tries == len(PAUSES):
+            if not error.transient or tries == len(patience.PAUSES):
                 raise
-            log.warning("%s; trying again in %g s", error, PAUSES[tries])
-            time.sleep(PAUSES[tries])
+            log.warning("%s; trying again in %g s", error, patience.PAUSES[tries])
+            time.sleep(patience.PAUSES[tries])
             tries += 1
 
 

@@ -36,7 +36,7 @@ OWNERS = {
     "uvicorn": ("flows/browser/", "flows/server.py"),
 }
 #: Prefect is wired in one module, with its pages and its schedules beside it; the driver knows nothing of it.
-PREFECT = {"flows/campaign.py", "flows/artifacts.py", "flows/deployment.py", "flows/server.py"}
+PREFECT = {"flows/campaign.py", "flows/artifacts.py", "flows/cancelling.py", "flows/deployment.py", "flows/server.py"}
 
 FILES = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
 

@@ -5,20 +5,24 @@ from __future__ import annotations
 import json
 import re
 import socket
+import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import catalogs
 import fsspec
 import pytest
+import sqlalchemy as sa
 from fsspec.implementations.memory import MemoryFileSystem
 from small_runs import BATCHES, FRAMES, SETTINGS, Finished, chunk, products, run_arguments, unpacked
 
 from coslidar.catalog import heartbeats, open_catalog
-from coslidar.catalog.store import RunRow
-from coslidar.flows import batches, tasks
+from coslidar.catalog.database import passing
+from coslidar.catalog.store import Catalog, RunRow
+from coslidar.flows import batches, patience, tasks
 from coslidar.flows.batches import Workers
 from coslidar.flows.options import Options
 from coslidar.flows.plan import plan_archive
@@ -176,7 +180,7 @@ def remote(recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         return honest(self, path, *arguments, **more)
 
     monkeypatch.setattr(MemoryFileSystem, "cat_file", cat_file)
-    monkeypatch.setattr(tasks, "PAUSES", (0.0, 0.0, 0.0))
+    monkeypatch.setattr(patience, "PAUSES", (0.0, 0.0, 0.0))
     yield network
     fs.rm("/far", recursive=True)
 
@@ -199,7 +203,7 @@ def test_a_network_that_is_down_is_no_damage_and_is_tried_again_by_the_next_run(
     settings = settings_for([remote.url], tmp_path / "out", "run.threads=1")
     (outcome,) = run(settings, prefect=False)
     assert (outcome.status, outcome.input_fault, outcome.failed_batches) == ("failed", False, 2)
-    assert remote.asked == 2 * (1 + len(tasks.PAUSES))
+    assert remote.asked == 2 * (1 + len(patience.PAUSES))
     assert all("cannot be reached" in fault and "connection reset by peer" in fault for fault in outcome.faults)
     with open_catalog(tmp_path / "out") as catalog:
         reasons = [failure.reason for failure in catalog.failures()]
@@ -224,6 +228,104 @@ def test_damage_behind_a_network_is_not_tried_again(remote: Network, tmp_path: P
     assert all("damaged" in fault for fault in outcome.faults)
     with open_catalog(tmp_path / "out") as catalog:
         assert not any(failure.reason.startswith("transient") for failure in catalog.failures())
+
+
+@pytest.fixture
+def answers(remote: Network, monkeypatch: pytest.MonkeyPatch) -> list[Exception]:
+    """Exceptions with which the store of the recording meets those who open it, one each."""
+    coming: list[Exception] = []
+    honest = MemoryFileSystem.info
+
+    def info(self: MemoryFileSystem, path: str, **more: Any) -> Any:
+        if coming:
+            raise coming.pop(0)
+        return honest(self, path, **more)
+
+    monkeypatch.setattr(MemoryFileSystem, "info", info)
+    return coming
+
+
+def test_a_store_that_hiccups_when_an_archive_is_opened_costs_nothing(
+    remote: Network, answers: list[Exception], whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    answers += [ConnectionResetError("reset"), TimeoutError("too slow"), OSError("no route")]
+    (outcome,) = run(settings_for([remote.url], tmp_path / "out"), prefect=False)
+    assert (outcome.status, outcome.failed_batches, answers) == ("published", 0, [])
+    (content,) = products(tmp_path / "out").values()
+    assert content in whole.values()
+
+
+def test_a_store_that_is_down_or_closed_to_us_is_told_apart(
+    remote: Network, answers: list[Exception], recordings: list[str], main_here: Main, tmp_path: Path
+) -> None:
+    arguments = run_arguments([remote.url], tmp_path / "out")
+    answers += [ConnectionResetError("reset")] * (1 + len(patience.PAUSES))
+    down = main_here(*arguments)
+    assert (down.code, answers) == (1, []), down.err
+    assert "does not answer as it should (ConnectionResetError: reset)" in down.err
+    with open_catalog(tmp_path / "out") as catalog:
+        (failure,) = catalog.failures()
+    assert failure.reason.startswith("transient: ")
+    assert "is tried again by" in main_here("status", "--out", tmp_path / "out").out
+    # Nobody is let in for asking again.
+    answers += [PermissionError("who are you?")] * 4
+    closed = main_here(*arguments)
+    assert (closed.code, len(answers)) == (2, 3), closed.err
+
+
+def test_a_database_that_is_lost_for_a_moment_costs_nothing(
+    recordings: list[str], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "PAUSES", (0.0, 0.0, 0.0))
+    honest, tries = Catalog.publish, []
+
+    def publish(self: Catalog, *arguments: Any, **more: Any) -> Any:
+        tries.append(1)
+        if len(tries) % 2:
+            raise sa.exc.OperationalError("INSERT", {}, Exception("server closed the connection unexpectedly"))
+        return honest(self, *arguments, **more)
+
+    monkeypatch.setattr(Catalog, "publish", publish)
+    outcomes = run(settings_for(recordings[:2], tmp_path / "out"), prefect=False)
+    assert [(outcome.status, outcome.frames_read, outcome.faults) for outcome in outcomes] == [
+        ("published", 0, ()),  # in the second try: what was computed in the first one was kept
+        ("published", 0, ()),
+    ]
+    assert products(tmp_path / "out").items() <= whole.items()
+    # A file is not lost for a moment: that the disk is full is told at once.
+    assert not passing(sa.exc.OperationalError("INSERT", {}, sqlite3.OperationalError("database or disk is full")))
+
+
+@pytest.mark.skipif(not catalogs.SERVER, reason="COSLIDAR_TEST_POSTGRESQL names no server")
+def test_a_postgresql_server_that_drops_its_connections_costs_nothing(
+    main_here: Main, recordings: list[str], whole: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(patience, "PAUSES", (0.0, 0.0, 0.0))
+    out = tmp_path / "out"
+    drop = sa.text(
+        "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity WHERE application_name = 'coslidar-dropped'"
+    )
+    dropped = []
+    with catalogs.database_of("postgresql", tmp_path) as database:
+        url = sa.make_url(database)
+        mine = url.update_query_dict({"application_name": "coslidar-dropped"}).render_as_string(hide_password=False)
+        made = main_here("catalog", "create", "--out", out, "--database", mine)
+        assert made.code == 0, made.err
+        server = sa.create_engine(url)
+
+        class Watcher(Silent):
+            def advanced(self, archive: str, index: int, reason: str) -> None:
+                with server.connect() as connection:
+                    dropped.append(connection.scalar(drop))
+
+        outcomes = run(settings_for(recordings, out), Watcher(), prefect=False)
+        server.dispose()
+        assert [outcome.status for outcome in outcomes] == ["published"] * 3
+        assert sum(dropped) > 0
+        # From a machine that sees the catalog only.
+        told = main_here("status", "--out", out)
+        assert told.out.splitlines()[0].endswith(": finished")
+    assert products(out) == whole
 
 
 # --- the state of runs -------------------------------------------------------------------------------------

@@ -955,6 +955,25 @@ def test_http_urls(small: Path, served: tuple[Path, str, str]) -> None:
         open_archive("http://127.0.0.1:9/a.zarr")
 
 
+@pytest.mark.parametrize(("status", "transient"), [(403, False), (400, False), (429, True), (503, True)])
+def test_a_server_that_may_be_back_soon_is_told_from_one_that_refuses(
+    small: Path, monkeypatch: pytest.MonkeyPatch, status: int, transient: bool
+) -> None:
+    class Answer(Exception):
+        """As of an HTTP client."""
+
+    error = Answer(f"{status} from the server")
+    error.status = status  # type: ignore[attr-defined]
+
+    def info(*_: Any, **__: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(type(fsspec.filesystem("memory")), "info", info)
+    with pytest.raises(ArchiveError, match="does not answer as it should") as caught:
+        open_archive("memory://bucket/small.zarr")
+    assert pickle.loads(pickle.dumps(caught.value)).transient is transient
+
+
 def test_a_failed_replacement_puts_back_what_was_there(small: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = open_archive(small).identity
 
