@@ -11,6 +11,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from prefect_servers import prefect_server
 from small_runs import Finished, environment, products, run_arguments, wait_for
 
 from coslidar.flows import server
@@ -97,25 +98,16 @@ def test_a_server_ends_with_its_run(tmp_path: Path, cache: Path) -> None:
 
 @pytest.mark.cluster
 @pytest.mark.slow
-def test_somebody_elses_server(coslidar: Call, recordings: list[str], tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
+def test_somebody_elses_server(kind: str, coslidar: Call, recordings: list[str], tmp_path: Path, cache: Path) -> None:
     """Two runs at once on the server of PREFECT_API_URL, which sees both and is not stopped."""
-    port = server._free_port()
-    url = f"http://127.0.0.1:{port}/api"
-    theirs = environment(cache, PREFECT_HOME=str(tmp_path / "theirs"), **server.quiet_environment())
-    with (tmp_path / "server.log").open("wb") as log:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "prefect", "server", "start", "--no-ui", "--host", "127.0.0.1", "--port", str(port)],
-            env=theirs,
-            stdout=log,
-            stderr=log,
-        )
-    try:
-        assert wait_for(lambda: _healthy(url) or process.poll() is not None, 120, step=0.2)
-        assert process.poll() is None
+    with prefect_server(kind, tmp_path, cache) as theirs:
         with ThreadPoolExecutor(2) as pool:
             both = [
                 pool.submit(
-                    coslidar, *run_arguments(recordings, tmp_path / f"out{number}", prefect=True), PREFECT_API_URL=url
+                    coslidar,
+                    *run_arguments(recordings, tmp_path / f"out{number}", prefect=True),
+                    PREFECT_API_URL=theirs.url,
                 )
                 for number in range(2)
             ]
@@ -124,36 +116,8 @@ def test_somebody_elses_server(coslidar: Call, recordings: list[str], tmp_path: 
                 assert len(done.err.splitlines()) == 4, done.err
         assert products(tmp_path / "out0") == products(tmp_path / "out1")
         assert len(products(tmp_path / "out0")) == 3
-        assert process.poll() is None
-        assert _finished_runs(url) == {"flow_runs": 2, "task_runs": 6}
-    finally:
-        process.terminate()
-        process.wait(30)
-
-
-def _healthy(url: str) -> bool:
-    from urllib.error import URLError
-    from urllib.request import urlopen
-
-    try:
-        with urlopen(f"{url}/health", timeout=2):
-            return True
-    except (URLError, OSError):
-        return False
-
-
-def _finished_runs(url: str) -> dict[str, int]:
-    """Completed runs that a server knows, by kind."""
-    import json
-    from urllib.request import Request, urlopen
-
-    found = {}
-    for kind in ("flow_runs", "task_runs"):
-        body = json.dumps({kind: {"state": {"type": {"any_": ["COMPLETED"]}}}}).encode()
-        request = Request(f"{url}/{kind}/count", body, {"Content-Type": "application/json"})
-        with urlopen(request, timeout=20) as answer:
-            found[kind] = json.loads(answer.read())
-    return found
+        assert theirs.process.poll() is None
+        assert (theirs.count("flow_runs", "COMPLETED"), theirs.count("task_runs", "COMPLETED")) == (2, 6)
 
 
 @pytest.mark.cluster
