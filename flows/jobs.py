@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import signal
 import sys
 import tempfile
 from contextlib import ExitStack, contextmanager
@@ -31,6 +32,8 @@ SYSTEMS = {
     "oar": ("OARCluster", "oarsub"),
     "htcondor": ("HTCondorCluster", "condor_submit"),
 }
+#: Variables that numerical libraries take their number of threads from.
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 #: Attributes of dask's Security that hold a certificate or a key.
 _CERTIFICATES = (
     "tls_ca_file",
@@ -77,11 +80,10 @@ def _arguments(jobs: JobParameters) -> dict[str, Any]:
         "memory": jobs.memory,
         "interface": jobs.interface,
         "job_extra_directives": list(jobs.directives),
-        # One thread of a library per task; compiled kernels are kept where the workers of a node find them.
-        "job_script_prologue": [
-            *(f"export {name}=1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")),
-            *jobs.prologue,
-        ],
+        # The workers' pages are the one thing that TLS does not cover.
+        "worker_extra_args": ["--dashboard-address", "127.0.0.1:0"],
+        # One thread of a library per task, before any is loaded.
+        "job_script_prologue": [f"export {name}=1" for name in ONE_THREAD] + list(jobs.prologue),
         "job_name": "coslidar",
         "python": sys.executable,
     }
@@ -116,6 +118,7 @@ def submitted(jobs: JobParameters, folder: Path) -> Iterator[Any]:
         dask-jobqueue or the batch system is missing, or it refuses the jobs.
     """
     kind, command = SYSTEMS[jobs.system]
+    heard = signal.getsignal(signal.SIGINT)
     try:
         import dask_jobqueue
         from distributed.security import Security
@@ -125,6 +128,8 @@ def submitted(jobs: JobParameters, folder: Path) -> Iterator[Any]:
         raise Unavailable(
             f"run.jobs needs packages that are not installed ({error}); pip install 'coslidar[jobqueue]'"
         ) from error
+    # Its import takes Ctrl-C for a reason to leave without a word, and with success.
+    signal.signal(signal.SIGINT, heard)
     if shutil.which(command) is None:
         raise Unavailable(
             f"run.jobs.system = '{jobs.system}': there is no command '{command}' on this machine; start the run where "

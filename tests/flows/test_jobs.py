@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import signal
+import socket
+import ssl
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import psutil
@@ -110,6 +113,73 @@ def test_jobs_that_are_refused_or_never_start(
     (line,) = held.err.splitlines()
     assert "none started within 3 s (run.jobs.patience)" in line
     assert wait_for(lambda: slurm.ask("squeue", "-h") == "", 30, 0.2)
+
+
+def listening(processes: Iterable[psutil.Process]) -> set[tuple[str, int]]:
+    """Addresses and ports on which processes of this machine wait for others."""
+    return {
+        (connection.laddr.ip, connection.laddr.port)
+        for one in processes
+        for connection in one.net_connections("inet")
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+def speaks_tls(address: tuple[str, int]) -> bool:
+    """Whether a handshake begins there; nobody of ours goes on without a certificate."""
+    context = ssl.create_default_context()
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    with socket.create_connection(address, 5) as plain:
+        try:
+            with context.wrap_socket(plain):
+                return True
+        except ssl.SSLError as error:
+            return "WRONG_VERSION" not in str(error) and "record layer" not in str(error)
+        except OSError:
+            return False
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_interrupted_jobs_leave_nothing_behind(
+    slurm: Slurm,
+    started: Callable[..., subprocess.Popen[str]],
+    recordings: list[str],
+    tmp_path: Path,
+    number: signal.Signals,
+) -> None:
+    """While they compute nothing listens beyond this machine without TLS; then they go, whatever ended their driver."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import time\nfrom coslidar.pipeline import batch\nhonest = batch.retrieve\n"
+        "batch.retrieve = lambda *a: (time.sleep(5), honest(*a))[1]\n"
+    )
+    out = tmp_path / "out"
+    process = started(
+        *run_arguments(recordings, out, *jobs("run.jobs.directives=['--mem=0']", "run.jobs.patience=90 s")),
+        PYTHONPATH=str(tmp_path),
+        **slurm.environment,
+    )
+    assert wait_for(lambda: any((out / "correlations").glob("??/*.npz")) or process.poll() is not None, 120)
+    assert process.poll() is None, process.communicate()
+    workers = [one for one in psutil.process_iter(["cmdline"]) if "dask_worker" in " ".join(one.info["cmdline"] or ())]
+    mine = [one for one in workers if one.environ().get("PYTHONPATH") == str(tmp_path)]
+    assert mine
+    everyone = {one.pid: one for each in [psutil.Process(process.pid), *mine] for one in [each, *family(each.pid)]}
+    heard = {address for address in listening(everyone.values()) if address[0] not in ("127.0.0.1", "::1")}
+    assert heard  # nodes must reach the driver
+    assert [
+        address
+        for address in heard
+        if not speaks_tls(("127.0.0.1", address[1]) if address[0] == "0.0.0.0" else address)
+    ] == []
+    process.send_signal(number)
+    _, err = process.communicate(timeout=90)
+    assert process.returncode == (-9 if number == signal.SIGKILL else 130), err
+    if number != signal.SIGKILL:
+        assert "coslidar: interrupted; what was finished is kept" in err
+    assert wait_for(lambda: not any(one.is_running() for one in everyone.values()), 120, 0.2)
+    assert wait_for(lambda: slurm.ask("squeue", "-h") == "", 60, 0.2)
 
 
 class Secured:
