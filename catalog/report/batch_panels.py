@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ...pipeline.geometry import MAP_KINDS
 from .reading import Floats, Maps, edges, log_mu, maps, of_batch, scalar
 from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, SEQUENTIAL
-from .words import measured, number, scientific
+from .words import aligned, measured, number, scientific
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -576,12 +576,12 @@ def profile_rows(dataset: Dataset, batch: int) -> list[list[str]]:
     cn2 = of_batch(dataset, "cn2", batch)
     if cn2 is None:
         return []
-    border = edges(dataset)
+    border = aligned(edges(dataset))
     error, error_ml, active, limit = _limits(dataset, batch, cn2.shape)
     return [
         [
-            number(border[i], 5),
-            number(border[i + 1], 5),
+            border[i],
+            border[i + 1],
             scientific(cn2[i]),
             scientific(error[i]),
             scientific(error_ml[i]),

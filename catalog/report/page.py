@@ -339,8 +339,8 @@ TIME_PANELS = (
     TimePanel(
         "quality",
         "Which batches need care?",
-        "A bar shows when a flag was raised: plain bars mean usable with care, crossed bars mean bad. The number "
-        "behind its name counts the batches.",
+        "A bar shows when a flag was raised: filled bars mean usable with care, crossed bars mean bad, and an open bar "
+        "is a remark on a batch that may be good. The number behind its name counts the batches.",
         (10.0, 4.3),
         over.compose_quality,
         over.describe_quality,
@@ -488,10 +488,10 @@ def key_numbers(products: Sequence[Dataset]) -> list[dict[str, str]]:
         {"name": "Cn², mean over the path", "value": value, "unit": "m^(-2/3)", "remark": remark},
         number_of("r0_profile", "Fried parameter r₀, from the profile", "cm", 100),
         *([number_of("r0_direct", "Fried parameter r₀, direct", "cm", 100)] if "r0_direct" in products[0] else []),
-        number_of("scintillation_index_profile", "scintillation index, from the profile", ""),
-        number_of("scintillation_index_direct", "scintillation index, direct", ""),
+        number_of("scintillation_index_profile", "Scintillation index, from the profile", ""),
+        number_of("scintillation_index_direct", "Scintillation index, direct", ""),
         number_of("chi2_reduced", "χ² per datum", ""),
-        number_of("degrees_of_freedom", "degrees of freedom for signal", ""),
+        number_of("degrees_of_freedom", "Degrees of freedom for signal", ""),
     ]
 
 
@@ -536,7 +536,7 @@ def geometry(products: Sequence[Dataset]) -> list[dict[str, str]]:
     found: dict[tuple[str, ...], None] = {}
     for dataset in products:
         rows = [("Path length", *_quantity(dataset.attrs.get("path_length")), "")]
-        rows.append(("Subaperture", *_quantity(dataset.attrs.get("subaperture_size"), 100, "cm"), ""))
+        rows.append(("Subaperture", *_quantity(dataset.attrs.get("subaperture_size"), 100, "cm", 3), ""))
         if "dy" in dataset and dataset.sizes["dy"] > 1:
             dy = np.asarray(dataset["dy"].values, dtype=np.float64)
             rows.append(("Pupil along y", number(100 * ((dy[-1] - dy[0]) / 2 + dy[1] - dy[0]), 3), "cm", ""))
@@ -563,11 +563,11 @@ def geometry(products: Sequence[Dataset]) -> list[dict[str, str]]:
     return [dict(zip(("name", "value", "unit", "remark"), row, strict=True)) for row in found]
 
 
-def _quantity(value: object, factor: float = 1.0, unit: str = "m") -> tuple[str, str]:
+def _quantity(value: object, factor: float = 1.0, unit: str = "m", digits: int = 4) -> tuple[str, str]:
     """Number and unit of a length written as text in metres; empty where it is none."""
     amount, _, written = str(value).partition(" ")
     try:
-        return (number(factor * float(amount), 4), unit) if written == "m" else ("", "")
+        return (number(factor * float(amount), digits), unit) if written == "m" else ("", "")
     except ValueError:
         return "", ""
 

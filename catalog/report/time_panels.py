@@ -499,6 +499,7 @@ def describe_selection(datasets: Sequence[Dataset]) -> str:
                    else ".")  # fmt: skip
 
 
+_OF_MEAN = "its 68 % interval"
 #: Marker, dashes and colour of the averages along the path.
 _AVERAGES = (("s", (0, (5, 2)), GREEN), ("o", (0, (1, 1.5)), RED), ("^", (0, (6, 2, 1, 2)), PURPLE))
 
@@ -511,11 +512,10 @@ def draw_averages(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
     positive = []
     if mean is not None:
         if low is not None and high is not None:
-            words = "its 68 % interval"
             if mean.values.size <= MARKED:
-                ax.vlines(mean.days, low.values, high.values, color=BLUE, lw=1.4, label=words)
+                ax.vlines(mean.days, low.values, high.values, color=BLUE, lw=1.4, label=_OF_MEAN)
             else:
-                ax.fill_between(mean.days, low.values, high.values, color=BLUE, alpha=0.25, lw=0, label=words)
+                ax.fill_between(mean.days, low.values, high.values, color=BLUE, alpha=0.25, lw=0, label=_OF_MEAN)
         _follow(ax, mean, "mean along the path", color=BLUE, marker="D", ls="-", ms=5)
         positive.append(mean.values)
     count = max(dataset.sizes.get("scintillometer", 0) for dataset in products)
@@ -531,7 +531,10 @@ def draw_averages(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
         ax.set_yscale("log")
     ax.grid(axis="y", which="both")
     ax.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
-    ax.legend(loc="lower left", bbox_to_anchor=(0.0, 0.0), fontsize=11)
+    handles, words = ax.get_legend_handles_labels()
+    if len(words) > 1 and words[0] == _OF_MEAN:
+        handles[:2], words[:2] = handles[1::-1], words[1::-1]
+    ax.legend(handles, words, loc="lower left", bbox_to_anchor=(0.0, 0.0), fontsize=11)
     return time_axis(ax, products)
 
 
@@ -574,7 +577,7 @@ def draw_quality(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
                 left, right = limit[first + a, 0], limit[first + b - 1, 1]
                 bars.append((left, max(right - left, least)))
         if bars:
-            ax.broken_barh(bars, (row - 0.32, 0.64), fc=RED if level == 2 else BLUE, ec=INK, lw=0.6,
+            ax.broken_barh(bars, (row - 0.32, 0.64), fc=(PAPER, BLUE, RED)[level], ec=INK, lw=0.6,
                            hatch="xxx" if level == 2 else "")  # fmt: skip
         words.append(f"{name.replace('_', ' ')} ({int(here.sum())})")
     ax.set_ylim(len(names) - 0.5, -0.6)

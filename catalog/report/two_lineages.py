@@ -11,7 +11,7 @@ from .page import path_mean
 from .reading import bounds, edges, log_mu, of_batch, scalar
 from .style import BLUE, RED, figure_style
 from .svg import inline_svg
-from .words import mapping, number, scientific
+from .words import aligned, mapping, number, scientific
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -134,8 +134,9 @@ def slice_rows(a: Dataset, b: Dataset, i: int, j: int) -> list[list[str]]:
     both = np.hypot(*(np.full(left.shape, np.nan) if bar is None else bar for bar in bars))
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio, apart = right / left, (right - left) / both
+    places = aligned(border)
     return [
-        [number(border[n], 5), number(border[n + 1], 5), scientific(left[n]), scientific(right[n]),
+        [places[n], places[n + 1], scientific(left[n]), scientific(right[n]),
          number(ratio[n]) if np.isfinite(ratio[n]) else "–", number(apart[n], 2)]
         for n in range(left.size)
     ]  # fmt: skip

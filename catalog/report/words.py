@@ -7,7 +7,7 @@ import json
 import math
 import re
 import zoneinfo
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -80,6 +80,12 @@ def moment(time: int, zone: datetime.tzinfo = datetime.UTC) -> datetime.datetime
         return utc.astimezone(zone)
     except OverflowError:
         return None
+
+
+def aligned(lengths: Iterable[float]) -> list[str]:
+    """Lengths in m with the same decimals, so that they stand below each other."""
+    found = [float(length) for length in lengths]
+    return [f"{length:.{1 if max(found) >= 100 else 4}f}" for length in found]
 
 
 def clock(time: int, zone: datetime.tzinfo = datetime.UTC) -> str:

@@ -148,6 +148,7 @@ class Pages:
             "clock": clock, "query": lambda query: urlencode(query), "svg": Markup, "level": lambda n: LEVELS[n],
         }  # fmt: skip
         self._templates.filters["units"] = raised_units
+        self._templates.filters["second"] = lambda time: clock(time // 10**9 * 10**9)
 
     def app(self) -> Starlette:
         """The application, without its guard."""
