@@ -272,7 +272,7 @@ def _words(grid: LensletGrid) -> str:
     return (
         f"{grid.kind} grid, pitch {grid.pitch[0]:.2f} x {grid.pitch[1]:.2f} px, "
         f"{int(grid.mask.sum())} of {rows} x {cols} lenslets, {spots} of {grid.fwhm:.1f} px"
-        + (f", turned {math.degrees(grid.rotation):.2f} deg" if grid.kind == "rectangular" else "")
+        + (f", turned {round(math.degrees(grid.rotation), 2) + 0.0:.2f} deg" if grid.kind == "rectangular" else "")
     )
 
 
