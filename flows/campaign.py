@@ -28,7 +28,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-@task(name="archive", task_run_name="{url}", cache_policy=NO_CACHE, persist_result=False)
+#: What a limit on the server bounds the archives in flight by, over all runs: prefect concurrency-limit create TAG N.
+TAG = "coslidar-archive"
+
+
+@task(name="archive", task_run_name="{url}", tags={TAG}, cache_policy=NO_CACHE, persist_result=False)
 def archive_task(url: str, work: Work) -> State[ArchiveOutcome]:
     """Process one archive; its state says what became of it."""
     outcome = process_archive(url, work)

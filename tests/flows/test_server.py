@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 
 import psutil
@@ -118,6 +119,31 @@ def test_somebody_elses_server(kind: str, coslidar: Call, recordings: list[str],
         assert len(products(tmp_path / "out0")) == 3
         assert theirs.process.poll() is None
         assert (theirs.count("flow_runs", "COMPLETED"), theirs.count("task_runs", "COMPLETED")) == (2, 6)
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_a_limit_on_the_server_holds_for_all_runs_together(
+    coslidar: Call, recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path, cache: Path
+) -> None:
+    with prefect_server("sqlite", tmp_path, cache) as theirs:
+        theirs.prefect(cache, "concurrency-limit", "create", "coslidar-archive", "1")
+        with ThreadPoolExecutor(2) as pool:
+            runs = [
+                pool.submit(
+                    coslidar,
+                    *run_arguments(recordings, tmp_path / f"out{number}", prefect=True),
+                    PREFECT_API_URL=theirs.url,
+                )
+                for number in range(2)
+            ]
+            for done in (future.result() for future in runs):
+                assert done.code == 0, done.err
+        spans = sorted((one["start_time"], one["end_time"]) for one in theirs.all("task_runs"))
+        assert len(spans) == 6
+        # Although each run may have two archives in flight, there is one at a time in all.
+        assert all(before[1] <= after[0] for before, after in pairwise(spans)), spans
+    assert products(tmp_path / "out0") == products(tmp_path / "out1") == undisturbed
 
 
 @pytest.mark.cluster
