@@ -31,7 +31,7 @@ from scipy import ndimage
 
 from .bad_pixels import no_bad_pixels
 from .refinement import refine
-from .spots import FLAGS, Calibration, SpotLayout
+from .spots import FLAGS, Calibration, SpotLayout, eights
 from .window_kernel import window_kernel
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 __all__ = ["FLAGS", "Calibration", "SpotLayout", "extract", "response_to_tilt"]
 
 #: Changes whenever the numbers that this stage returns for the same input change.
-VERSION = 3
+VERSION = 4
 
 #: Part of its mean flux below which a spot is taken to be absent from a frame.
 FLUX_FLOOR = 0.02
@@ -96,33 +96,23 @@ def extract(
     slopes = np.empty((len(frames), 2, n_sources, n_boxes))
     flux = np.empty((len(frames), n_sources, n_boxes))
     flag = np.empty((len(frames), n_sources, n_boxes), dtype=np.uint8)
-    columns = layout.pitch[1]
-    length = layout.scale.shape[-1]
+    rows, cols = layout.pitch
     tall, wide = (int(side) for side in layout.window)
-    first_box = np.append(layout.bands[:, 3], n_boxes)
-    column = layout.boxes[:, 1] - np.repeat(layout.bands[:, 1], np.diff(first_box))
-    # Pixels of a box, counted in its band.
-    behind = np.repeat(column, np.diff(layout.bad_start))
-    bad_index = layout.bad_index // columns * length + layout.bad_index % columns + behind
-    bad_neighbour = layout.bad_neighbour // columns * length + layout.bad_neighbour % columns + behind[:, None]
+    usual, across = layout.usual
     whole = parameters.method == "moving_maximum"
-    window_kernel(_eights(int(2 * parameters.search)), tall, _eights(wide + 2))(
+    window_kernel(cols, across, eights(int(2 * parameters.search)), tall, eights(wide + 2))(
         frames.reshape(-1),
         len(frames),
         layout.frame_shape[0] * layout.frame_shape[1],
         layout.frame_shape[1],
-        layout.bands[:, 0] * layout.frame_shape[1] + layout.bands[:, 1],
-        layout.bands[:, 2],
-        columns,
-        length,
-        first_box,
-        column,
-        layout.pitch[0],
+        layout.boxes[:, 0] * layout.frame_shape[1] + layout.boxes[:, 1],
+        rows,
+        usual,
         layout.scale.reshape(-1),
         layout.offset.reshape(-1),
         layout.bad_start,
-        bad_index,
-        bad_neighbour,
+        layout.bad_index,
+        layout.bad_neighbour,
         layout.bad_weight,
         layout.spots,
         layout.search,
@@ -226,7 +216,6 @@ def _bare(layout: SpotLayout, spots: Floats, search: float) -> SpotLayout:
         spots=spots,
         flux=np.zeros((n_sources, n_boxes)),
         search=search_region(spots, layout.pitch, search),
-        bands=np.stack([np.array([rows * box, 0, cols, box]) for box in range(n_boxes)]),
         scale=np.ones((n_boxes, rows, cols), dtype=np.float32),
         offset=np.zeros((n_boxes, rows, cols), dtype=np.float32),
         suspect=np.full(n_boxes, np.inf, dtype=np.float32),
@@ -244,11 +233,6 @@ def measure_boxes(layout: SpotLayout, boxes: Floats, parameters: ExtractionParam
     frame = boxes.astype(np.float32).reshape(1, *bare.frame_shape)
     moved, flux, _ = extract(frame, bare, Calibration(), parameters)
     return layout.spots + moved[0, ::-1].transpose(1, 2, 0), flux[0]
-
-
-def _eights(number: int) -> int:
-    """The next multiple of eight."""
-    return -(-number // 8) * 8
 
 
 def _half_way(spots: Floats) -> Floats:

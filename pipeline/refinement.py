@@ -46,8 +46,6 @@ class _Boxes(NamedTuple):
 
     corner: NDArray[np.int64]
     pitch: tuple[int, int]
-    band: NDArray[np.int64]
-    column: NDArray[np.int64]
     scale: NDArray[np.float32]
     offset: NDArray[np.float32]
     bad_start: NDArray[np.int64]
@@ -81,13 +79,9 @@ def refine(
     flag : ndarray of uint8, (T, S, A)
         Bits of `FLAGS`.
     """
-    bands, corner = layout.bands, layout.boxes
-    band = np.searchsorted(bands[:, 0], corner[:, 0])
     boxes = _Boxes(
-        corner,
+        layout.boxes,
         layout.pitch,
-        band,
-        corner[:, 1] - bands[band, 1],
         layout.scale,
         layout.offset,
         layout.bad_start,
@@ -141,11 +135,10 @@ def _read(
     """One calibrated box, its bad pixels predicted."""
     rows, cols = box.shape
     top, start = boxes.corner[a, 0], boxes.corner[a, 1]
-    n, left = boxes.band[a], boxes.column[a]
     for r in range(rows):
         for k in range(cols):
             raw = np.float32(frame[top + r, start + k])
-            box[r, k] = raw * boxes.scale[n, r, left + k] - boxes.offset[n, r, left + k]
+            box[r, k] = raw * boxes.scale[a, r, k] - boxes.offset[a, r, k]
     flat = box.reshape(-1)
     for b in range(boxes.bad_start[a], boxes.bad_start[a + 1]):
         flat[boxes.bad_index[b]] = np.float32(0)

@@ -124,7 +124,6 @@ def layout(
     else:
         fwhm, window = previous.fwhm, previous.window
     start, index, neighbour, weight = no_bad_pixels(len(boxes))
-    bands, band_scale, band_offset = _bands(boxes, scale, offset)
     first = SpotLayout(
         boxes=boxes,
         pitch=(rows, cols),
@@ -137,9 +136,8 @@ def layout(
         template=np.repeat(typical[None], len(nominal), axis=0),
         centre=nominal,
         search=search_region(spots, (rows, cols), parameters.search),
-        bands=bands,
-        scale=band_scale,
-        offset=band_offset,
+        scale=scale,
+        offset=offset,
         suspect=_lowest_saturated(scale, offset, calibration.saturation),
         bad_start=start,
         bad_index=index,
@@ -369,20 +367,3 @@ def _lowest_saturated(
     # Rounding of the calibrated value must not hide a saturated pixel.
     lowest -= np.abs(lowest) * np.float32(1e-5)
     return lowest
-
-
-def _bands(
-    boxes: NDArray[np.int64], scale: NDArray[np.float32], offset: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """Rows of lenslets, and scale and offset of the detector rows that they share."""
-    rows, first = np.unique(boxes[:, 0], return_index=True)
-    last = np.append(first[1:], len(boxes)) - 1
-    left, width = boxes[first, 1], boxes[last, 1] - boxes[first, 1] + scale.shape[2]
-    bands = np.stack([rows, left, width, first], axis=1).astype(np.int64)
-    joined = np.zeros((2, len(rows), scale.shape[1], width.max()), dtype=np.float32)
-    for box, (row, column) in enumerate(boxes):
-        band = int(np.searchsorted(rows, row))
-        columns = slice(column - left[band], column - left[band] + scale.shape[2])
-        joined[0, band, :, columns] = scale[box]
-        joined[1, band, :, columns] = offset[box]
-    return bands, joined[0], joined[1]

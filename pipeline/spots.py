@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,13 @@ FLAGS: dict[str, int] = {
 
 #: Step of the tables of wings, px.
 WING_STEP = 0.5
+#: How far from its mean place a window usually is, px.
+USUAL = 1.0
+
+
+def eights(number: int) -> int:
+    """The next multiple of eight."""
+    return -(-number // 8) * 8
 
 
 @dataclass(frozen=True)
@@ -79,11 +87,8 @@ class SpotLayout:
         Position of the source's spot in `template`.
     search : ndarray of int, (S, A, 4)
         First row, last row, first column, last column among which the brightest pixel is looked for.
-    bands : ndarray of int, (n, 4)
-        Rows of lenslets with a box: first row and first column of the detector, width, first box.
-    scale, offset : ndarray of float32, (n, rows, columns)
-        Calibrated pixel = raw * scale - offset for each band, from its first box to its last; both 0 on bad pixels
-        and between boxes.
+    scale, offset : ndarray of float32, (A, rows, cols)
+        Calibrated pixel = raw * scale - offset; both 0 on bad pixels.
     suspect : ndarray of float32, (A,)
         Calibrated value from which on a pixel of the box may be saturated.
     bad_start : ndarray of int, (A + 1,)
@@ -117,7 +122,6 @@ class SpotLayout:
     template: Floats
     centre: Floats
     search: NDArray[np.int64]
-    bands: NDArray[np.int64]
     scale: NDArray[np.float32]
     offset: NDArray[np.float32]
     suspect: NDArray[np.float32]
@@ -130,3 +134,23 @@ class SpotLayout:
     wings: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 2, 3), dtype=np.float32))
     wing_start: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2), dtype=np.float32))
     prepared: tuple[NDArray[Any], ...] = ()
+
+    @cached_property
+    def usual(self) -> tuple[NDArray[np.int64], int]:
+        """Part of each box that search and windows are usually in: first row, row behind the last, first column.
+
+        Returns
+        -------
+        ndarray of int, (A, 3), and the number of its columns.
+        """
+        half = np.array(self.window) / 2 + USUAL
+        # A pixel reaches half a pixel beyond its centre.
+        low = np.floor((self.spots + 0.5).min(axis=0) - half)
+        high = np.ceil((self.spots + 0.5).max(axis=0) + half)
+        low = np.minimum(low, self.search[..., ::2].min(axis=0)).clip(0)
+        high = np.maximum(high, self.search[..., 1::2].max(axis=0) + 1) + np.array([1, 0])
+        high = np.minimum(high, self.pitch)
+        across = min(eights(int((high - low)[:, 1].max())), self.pitch[1])
+        left = ((low + high)[:, 1] - across) // 2
+        parts = np.stack([low[:, 0], high[:, 0], left.clip(0, self.pitch[1] - across)], axis=1)
+        return parts.astype(np.int64), across
