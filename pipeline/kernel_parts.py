@@ -7,12 +7,13 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import njit, types
-from numba.core import cgutils
+from numba.core import cgutils as untyped
 from numba.extending import intrinsic
 
+cgutils: Any = untyped
 
-@intrinsic  # type: ignore[untyped-decorator]
-def bring_near(typing_context: Any, array: Any, place: Any) -> Any:
+
+def _bring_near(typing_context: Any, array: Any, place: Any) -> Any:
     """Have an element of an array brought near, without waiting for it; it need not exist."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -28,8 +29,12 @@ def bring_near(typing_context: Any, array: Any, place: Any) -> Any:
     return types.void(array, place), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _calibrate_8(typing_context: Any, frames: Any, i: Any, scale: Any, offset: Any, j: Any, box: Any, o: Any) -> Any:
+bring_near: Any = intrinsic(_bring_near)
+
+
+def _calibrate_eight(
+    typing_context: Any, frames: Any, i: Any, scale: Any, offset: Any, j: Any, box: Any, o: Any
+) -> Any:
     """box[o:o + 8] = frames[i:i + 8] * scale[j:j + 8] - offset[j:j + 8], in vector instructions.
 
     The compiler makes them by itself only for some lengths of a loop.
@@ -42,12 +47,12 @@ def _calibrate_8(typing_context: Any, frames: Any, i: Any, scale: Any, offset: A
             return builder.bitcast(pointer, ir.VectorType(kind, 8).as_pointer())
 
         def loaded(number: int, place: int) -> Any:
-            dtype = signature.args[number].dtype
+            dtype: Any = signature.args[number].dtype
             return builder.load(vector(number, place, context.get_data_type(dtype)), align=dtype.bitwidth // 8)
 
         single = ir.VectorType(ir.FloatType(), 8)
         raw, dtype = loaded(0, 1), signature.args[0].dtype
-        if isinstance(dtype, types.Integer):
+        if dtype in types.integer_domain:
             raw = builder.sitofp(raw, single) if dtype.signed else builder.uitofp(raw, single)
         flags = ("contract",)
         value = builder.fsub(builder.fmul(raw, loaded(2, 4), flags=flags), loaded(3, 4), flags=flags)
@@ -55,6 +60,9 @@ def _calibrate_8(typing_context: Any, frames: Any, i: Any, scale: Any, offset: A
         return context.get_dummy_value()
 
     return types.void(frames, i, scale, offset, j, box, o), generate
+
+
+_calibrate_8: Any = intrinsic(_calibrate_eight)
 
 
 @njit(nogil=True, fastmath={"contract"})
@@ -71,5 +79,5 @@ def calibrate(frames: Any, i: Any, scale: Any, offset: Any, j: Any, box: Any, o:
         for k in range(none, np.uint64(length - 7), eight):
             _calibrate_8(frames, i + k, scale, offset, j + k, box, o + k)
         if length % 8:
-            k = np.uint64(length - 8)  # some of them twice
-            _calibrate_8(frames, i + k, scale, offset, j + k, box, o + k)
+            last = np.uint64(length - 8)  # some of them twice
+            _calibrate_8(frames, i + last, scale, offset, j + last, box, o + last)

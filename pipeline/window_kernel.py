@@ -47,7 +47,8 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
     """
     # No nnan and no ninf: a pixel that is not a number must reach the tests below.
     relaxed = {"reassoc", "contract", "nsz", "arcp"}
-    single, long, index = np.float32, np.int64, np.uint64
+    single, index = np.float32, np.uint64
+    long: Any = np.int64
     half, one, none, nothing = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(-np.inf)
     edge = np.float32(1e-3)
     per_step = np.float32(1.0 / WING_STEP)
