@@ -22,6 +22,16 @@ from urllib.parse import urlsplit
 _LOCAL_HEADER = struct.Struct("<4s5H3I2H")
 #: Extra field that a remote read allows for, so that one request fetches header and data.
 _USUAL_EXTRA = 64
+#: Kinds of URL that archives are read from, and what to install for each. An allow list: others of fsspec's read files
+#: that name further files, fill in templates, or run in somebody's notebook, and packages add more.
+SCHEMES = {
+    **dict.fromkeys(("http", "https"), "coslidar[http]"),
+    **dict.fromkeys(("s3", "s3a"), "coslidar[s3]"),
+    **dict.fromkeys(("gs", "gcs"), "gcsfs"),
+    **dict.fromkeys(("abfs", "az"), "adlfs"),
+    **dict.fromkeys(("sftp", "ssh"), "paramiko"),
+    **dict.fromkeys(("ftp", "webhdfs", "memory"), "fsspec"),
+}
 #: Exceptions of aiohttp and botocore for a network that fails, which are no OSError.
 _NETWORK = frozenset(
     (
@@ -214,7 +224,7 @@ def open_store(url: str) -> Store:
     Parameters
     ----------
     url : str
-        Local path, or any URL that fsspec knows.
+        Local path, or a URL of one of :data:`SCHEMES`.
 
     Returns
     -------
@@ -301,14 +311,23 @@ def _said(error: BaseException) -> str:
 
 
 def _file_system(url: str) -> tuple[Any, str]:
+    scheme = urlsplit(url).scheme.lower()
+    if scheme not in SCHEMES or "::" in url:
+        raise StoreError(
+            f"archives are not read from this kind of URL; write one of {', '.join(f'{name}://' for name in SCHEMES)}, "
+            "or download the archive and name the copy"
+        )
     import fsspec
 
     try:
         fs, path = fsspec.core.url_to_fs(url)
     except ImportError as error:
-        raise StoreError(f"this kind of URL needs another package ({error})") from error
+        raise StoreError(
+            f"{scheme}:// needs a package that is not installed: pip install '{SCHEMES[scheme]}', on every worker too "
+            f"({_said(error)})"
+        ) from error
     except Exception as error:
-        raise StoreError(f"this is no URL that can be opened ({_said(error)})") from error
+        raise _failure(error)(f"this URL cannot be opened ({_said(error)})") from error
     return fs, str(path)
 
 
@@ -336,6 +355,13 @@ def _failure(error: BaseException) -> type[StoreError]:
     return UnreachableStore if network and not lasting else StoreError
 
 
+def _access(error: BaseException) -> str:
+    """What to do where a store wants to know who asks."""
+    if type(error).__name__ != "NoCredentialsError":
+        return ""
+    return "; set AWS_PROFILE, or AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, here and on every worker"
+
+
 def _remote_size(fs: Any, path: str) -> int | None:
     try:
         entry = fs.info(path)
@@ -343,7 +369,7 @@ def _remote_size(fs: Any, path: str) -> int | None:
         if _absent(fs, error):
             return None
         cause = error.__cause__ or error
-        raise _failure(cause)(f"the server does not answer as it should ({_said(cause)})") from error
+        raise _failure(cause)(f"the server does not answer as it should ({_said(cause)}){_access(cause)}") from error
     if entry.get("type") == "directory":
         return None
     if entry.get("size") is None:

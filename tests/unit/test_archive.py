@@ -624,7 +624,7 @@ def test_places_that_are_no_archive(tmp_path: Path, small: Path) -> None:
         str(pack(small, tmp_path / "n.zip", prefix="small.zarr/")): ["root of the zip", "small.zarr/zarr.json"],
         str(small / "frames"): ["no raw frame archive", "'array'"],
         str(pipe): ["neither a folder nor a file"],
-        "nosuch://place/a.zarr": ["no URL that can be opened"],
+        "nosuch://place/a.zarr": ["not read from this kind of URL"],
         "memory://nothing/here.zarr": ["no raw frame archive"],
         "memory://nothing/here.zip": ["no such file"],
     }.items():
@@ -953,6 +953,40 @@ def test_http_urls(small: Path, served: tuple[Path, str, str]) -> None:
         open_archive(f"{ranges}/absent.zip")
     with pytest.raises(ArchiveError, match="does not answer"):
         open_archive("http://127.0.0.1:9/a.zarr")
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "reference::file:///tmp/references.json",
+        "simplecache::http://127.0.0.1:9/a.zarr",
+        "jupyter://127.0.0.1:9/a.zarr",
+        "dask://a.zarr",
+        "python://os/system",
+    ],
+)
+def test_urls_that_are_more_than_a_place_are_refused(url: str) -> None:
+    with pytest.raises(ArchiveError, match=r"not read from this kind of URL; write one of http://, https://, s3://"):
+        open_archive(url)
+
+
+@pytest.mark.parametrize(
+    ("url", "package", "modules"),
+    [
+        ("https://127.0.0.1:9/a.zarr", r"coslidar\[http\]", ("aiohttp", "fsspec.implementations.http")),
+        ("s3://bucket/a.zarr", r"coslidar\[s3\]", ("s3fs",)),
+        ("gs://bucket/a.zarr", "gcsfs", ("gcsfs",)),
+        ("az://bucket/a.zarr", "adlfs", ("adlfs",)),
+    ],
+)
+def test_what_to_install_for_a_kind_of_url(
+    url: str, package: str, modules: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in modules:
+        monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules["fsspec.registry"]._registry, url.partition(":")[0], raising=False)
+    with pytest.raises(ArchiveError, match=rf"is not installed: pip install '{package}', on every worker too"):
+        open_archive(url)
 
 
 @pytest.mark.parametrize(("status", "transient"), [(403, False), (400, False), (429, True), (503, True)])
