@@ -27,6 +27,7 @@ from .archive_codecs import (
     ArraySpec,
     DamagedChunk,
     Missing,
+    Rooms,
     StoredArray,
     UnreachableChunk,
     find_chunks,
@@ -259,15 +260,23 @@ class Archive:
         """
         if not 0 <= i < self.n_chunks:
             raise IndexError(f"there is no chunk {i}; the archive has chunks 0 to {self.n_chunks - 1}")
-        return self._frames.plane(i, lambda key, error: ChunkError.of(shown(self.url), key, error))
+        return self._chunk(i)
 
-    def chunks(self, start: int = 0, stop: int | None = None) -> Iterator[tuple[int, NDArray[Any]]]:
+    def _chunk(self, i: int, rooms: Rooms | None = None) -> NDArray[Any]:
+        return self._frames.plane(i, lambda key, error: ChunkError.of(shown(self.url), key, error), rooms)
+
+    def chunks(
+        self, start: int = 0, stop: int | None = None, *, keep: int | None = None
+    ) -> Iterator[tuple[int, NDArray[Any]]]:
         """Read a range of frames, one chunk in memory at a time.
 
         Parameters
         ----------
         start, stop : int
             Frames [start, stop); to the end where `stop` is None.
+        keep : int, optional
+            How many of the arrays last yielded stay as they are; memory of earlier ones is used again, which makes
+            reading much cheaper. By default each is the caller's own.
 
         Yields
         ------
@@ -282,11 +291,12 @@ class Archive:
             A chunk is missing or damaged.
         """
         stop = self.n_frames if stop is None else min(stop, self.n_frames)
+        rooms = None if keep is None else Rooms(keep)
         for i in range(max(start, 0) // self.chunk_frames, -(-stop // self.chunk_frames)):
             first = i * self.chunk_frames
             begin, end = max(start, first), min(stop, first + self.chunk_frames)
             if begin < end:
-                yield begin, self.read_chunk(i)[begin - first : end - first]
+                yield begin, self._chunk(i, rooms)[begin - first : end - first]
 
     @cached_property
     def identity(self) -> str:
@@ -407,7 +417,7 @@ def _json(store: Store, key: str, fault: Faults) -> dict[str, Any] | None:
         fault.say(f"{key} holds {size} bytes, at most {MAX_METADATA_BYTES} are read; it is no metadata of an archive")
         return {}
     try:
-        text = store.read(key, verify=True).decode()
+        text = bytes(store.read(key, verify=True)).decode()
         found = json.loads(text, object_pairs_hook=_pairs, parse_float=_finite, parse_constant=_finite)
         if _depth(found) > MAX_DEPTH:
             raise ValueError(f"nested more than {MAX_DEPTH} deep")

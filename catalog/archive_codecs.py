@@ -22,7 +22,7 @@ import numpy as np
 from numcodecs import blosc, zstd
 from numpy.typing import NDArray
 
-from .archive_stores import Store, UnreachableStore
+from .archive_stores import Room, Store, UnreachableStore
 
 #: One chunk holds at most this many bytes uncompressed.
 MAX_CHUNK_BYTES = 256 * 2**20
@@ -54,18 +54,61 @@ _UNREACHABLE = frozenset(
 class Codec(Protocol):
     """One bytes-to-bytes step of decoding."""
 
-    def decode(self, data: memoryview, size: int | None, limit: int) -> memoryview:
-        """Undo the step. `size` is the exact result length where it is known, `limit` the largest allowed."""
+    def decode(self, data: memoryview, size: int | None, limit: int, room: Room | None = None) -> memoryview:
+        """Undo the step.
+
+        `size` is the exact result length where it is known, `limit` the largest allowed; `room` is where the result
+        may be put.
+        """
 
     def encoded_size(self, size: int | None) -> int | None:
         """Length of what encoding `size` bytes gives, where it does not depend on the data."""
+
+
+def _space(size: int, room: Room | None) -> memoryview:
+    return np.empty(size, np.uint8).data if room is None else room(size)
+
+
+class Rooms:
+    """Memory that is used again from chunk to chunk: fresh memory costs more than decoding into it.
+
+    Parameters
+    ----------
+    keep : int
+        How many decoded chunks stay as they are; the next is put where the first of them was.
+    """
+
+    def __init__(self, keep: int) -> None:
+        self._stored = _aligned(0)
+        self._decoded = [_aligned(0)] * keep
+        self._next = 0
+
+    def stored(self, size: int) -> memoryview:
+        """Room for a chunk as stored."""
+        if size > len(self._stored):
+            self._stored = _aligned(size + size // 8)
+        return self._stored[:size].data
+
+    def decoded(self, size: int) -> memoryview:
+        """Room for a decoded chunk."""
+        number, self._next = self._next, (self._next + 1) % len(self._decoded)
+        if size > len(self._decoded[number]):
+            self._decoded[number] = _aligned(size)
+        return self._decoded[number][:size].data
+
+
+def _aligned(size: int) -> NDArray[np.uint8]:
+    """Bytes that begin at the border of a cache line."""
+    space = np.empty(size + 64, np.uint8)
+    begin = -space.ctypes.data % 64
+    return space[begin : begin + size]
 
 
 @dataclass(frozen=True)
 class Crc32c:
     """Checksum in the last four bytes."""
 
-    def decode(self, data: memoryview, size: int | None, limit: int) -> memoryview:
+    def decode(self, data: memoryview, size: int | None, limit: int, room: Room | None = None) -> memoryview:
         """See :class:`Codec`."""
         if len(data) < 4:
             raise DamagedChunk(f"truncated to {len(data)} bytes")
@@ -85,7 +128,7 @@ class Crc32c:
 class Blosc:
     """Blosc 1 container."""
 
-    def decode(self, data: memoryview, size: int | None, limit: int) -> memoryview:
+    def decode(self, data: memoryview, size: int | None, limit: int, room: Room | None = None) -> memoryview:
         """See :class:`Codec`."""
         if len(data) < 16:
             raise DamagedChunk(f"truncated to {len(data)} bytes, less than a blosc header")
@@ -96,13 +139,13 @@ class Blosc:
             raise DamagedChunk(f"its blosc header promises {decoded} bytes of data, expected {size or limit}")
         if version not in (1, 2) or typesize == 0 or (block == 0 and decoded):
             raise DamagedChunk("its blosc header makes no sense")
-        out = np.empty(decoded, np.uint8)
+        out = _space(decoded, room)
         if decoded:
             try:
                 blosc.decompress(data, out)
             except (RuntimeError, ValueError) as error:
                 raise DamagedChunk(f"blosc cannot decode it ({error})") from error
-        return out.data
+        return out
 
     def encoded_size(self, size: int | None) -> int | None:
         """See :class:`Codec`."""
@@ -113,19 +156,19 @@ class Blosc:
 class Zstd:
     """Zstandard frame."""
 
-    def decode(self, data: memoryview, size: int | None, limit: int) -> memoryview:
+    def decode(self, data: memoryview, size: int | None, limit: int, room: Room | None = None) -> memoryview:
         """See :class:`Codec`."""
         promised = _zstd_size(data)
         if promised is None:
             promised = size  # the frame does not say; the decoder stops at the end of the buffer
         if promised is None or promised > limit or (size is not None and promised != size):
             raise DamagedChunk(f"its zstd header promises {promised} bytes of data, expected {size or limit}")
-        out = np.empty(promised, np.uint8)
+        out = _space(promised, room)
         try:
             zstd.decompress(data, out)
         except (RuntimeError, ValueError) as error:
             raise DamagedChunk(f"zstd cannot decode it ({error})") from error
-        return out.data
+        return out
 
     def encoded_size(self, size: int | None) -> int | None:
         """See :class:`Codec`."""
@@ -151,7 +194,7 @@ def _zstd_size(data: memoryview) -> int | None:
 class Gzip:
     """Gzip stream."""
 
-    def decode(self, data: memoryview, size: int | None, limit: int) -> memoryview:
+    def decode(self, data: memoryview, size: int | None, limit: int, room: Room | None = None) -> memoryview:
         """See :class:`Codec`."""
         largest = limit if size is None else size
         decoder = zlib.decompressobj(wbits=31)
@@ -192,7 +235,9 @@ class Chain:
     steps: tuple[Codec, ...]
     names: tuple[str, ...]
 
-    def decode(self, data: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
+    def decode(
+        self, data: bytes | memoryview, shape: tuple[int, ...], dtype: np.dtype[Any], room: Room | None = None
+    ) -> NDArray[Any]:
         """Decode one chunk.
 
         Parameters
@@ -203,6 +248,8 @@ class Chain:
             Shape of the chunk.
         dtype : numpy.dtype
             Native data type.
+        room : callable, optional
+            Where to put it; `data` is not to be kept then.
 
         Returns
         -------
@@ -221,7 +268,8 @@ class Chain:
             expected.append(step.encoded_size(expected[-1]))
         view = memoryview(data)
         for step, length in zip(reversed(self.steps), reversed(expected[:-1]), strict=True):
-            view = step.decode(view, length, limit)
+            # What one decompressor has decoded may be what the next one reads.
+            view = step.decode(view, length, limit, room if step is self.steps[0] else None)
         if len(view) != size:
             raise DamagedChunk(f"it decodes to {len(view)} bytes, expected {size}")
         values = np.frombuffer(view, dtype.newbyteorder("<" if self.little_endian else ">"))
@@ -230,6 +278,8 @@ class Chain:
         values = values.reshape(shape)
         if dtype == np.bool_:
             values = values.view(np.uint8) != 0  # any other byte would be an invalid bool
+        if room is not None and not (self.steps and isinstance(self.steps[0], Blosc | Zstd)):
+            values = values.copy()  # it may still lie where the stored bytes do
         # Always the same kind of array: compiled kernels are specialised on memory order and writability.
         return np.require(values, dtype, ["C", "W", "A"])
 
@@ -246,7 +296,7 @@ class Sharding:
         """Bytes of the index of a shard of `count` chunks."""
         return 16 * count + (4 if self.checksum else 0)
 
-    def index(self, data: bytes, count: int) -> NDArray[np.uint64]:
+    def index(self, data: bytes | memoryview, count: int) -> NDArray[np.uint64]:
         """Decode a shard's index: (count, 2) offsets and sizes, all bits set where a chunk is missing."""
         view = memoryview(data)
         if self.checksum:
@@ -350,8 +400,8 @@ class StoredArray:
         offset, size = self.place[flat]
         return self.spec.key(stored), int(offset), int(size)
 
-    def fetch(self, flat: int, *, verify: bool = True) -> bytes:
-        """The stored bytes of a chunk.
+    def fetch(self, flat: int, *, verify: bool = True, room: Room | None = None) -> bytes | memoryview:
+        """The stored bytes of a chunk, in `room` where there is one.
 
         Raises
         ------
@@ -367,24 +417,29 @@ class StoredArray:
         # Where a chunk has no checksum of its own, that of the zip file is the only one.
         verify = verify and self.store.checksums and "crc32c" not in self.spec.chain.names
         try:
-            return self.store.read(key, offset, size, verify=verify)
+            return self.store.read(key, offset, size, verify=verify, room=room)
         except FileNotFoundError as error:
             raise DamagedChunk("missing since the archive was opened") from error
         except OSError as error:
             lost = isinstance(error, UnreachableStore) or error.errno in _UNREACHABLE
             raise (UnreachableChunk if lost else DamagedChunk)(str(error)) from error
 
-    def chunk(self, flat: int) -> NDArray[Any]:
-        """Decode a chunk, with its padding beyond the end of the array.
+    def chunk(self, flat: int, rooms: Rooms | None = None) -> NDArray[Any]:
+        """Decode a chunk, with its padding beyond the end of the array; in `rooms` where they are given.
 
         Raises
         ------
         DamagedChunk
             It is missing or damaged.
         """
-        return self.spec.chain.decode(self.fetch(flat), self.spec.chunk_shape, self.spec.dtype)
+        stored, decoded = (None, None) if rooms is None else (rooms.stored, rooms.decoded)
+        return self.spec.chain.decode(
+            self.fetch(flat, room=stored), self.spec.chunk_shape, self.spec.dtype, room=decoded
+        )
 
-    def plane(self, row: int, fault: Callable[[str, DamagedChunk], Exception]) -> NDArray[Any]:
+    def plane(
+        self, row: int, fault: Callable[[str, DamagedChunk], Exception], rooms: Rooms | None = None
+    ) -> NDArray[Any]:
         """All chunks with index `row` along the first axis, put together and cut to the array's shape.
 
         Parameters
@@ -393,19 +448,22 @@ class StoredArray:
             Index of the chunk along the first axis.
         fault : callable
             ``fault(key, error)`` gives the exception to raise for a damaged chunk.
+        rooms : Rooms, optional
+            Where to put it, if a chunk holds whole frames.
         """
         spec = self.spec
         first = row * spec.chunk_shape[0]
         shape = (min(spec.chunk_shape[0], spec.shape[0] - first), *spec.shape[1:])
         count = math.prod(spec.grid[1:])
+        alone = count == 1 and spec.chunk_shape[1:] == spec.shape[1:]
         out: NDArray[Any] | None = None
         for across in range(count):
             flat = row * count + across
             try:
-                chunk = self.chunk(flat)
+                chunk = self.chunk(flat, rooms if alone else None)
             except DamagedChunk as error:
                 raise fault(self.locate(flat)[0], error) from error
-            if count == 1 and spec.chunk_shape[1:] == spec.shape[1:]:
+            if alone:
                 return chunk[: shape[0]]
             if out is None:
                 out = np.empty(shape, spec.dtype)

@@ -11,11 +11,11 @@ import stat
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol, TypeVar
 from urllib.parse import urlsplit
 
 #: Fixed part of a zip member's local header; name and extra field follow, then the data.
@@ -46,6 +46,11 @@ _NETWORK = frozenset(
 _CONCURRENT_REQUESTS = 16
 
 
+#: Where bytes of a given number are to be put, by whoever can; those who cannot return bytes of their own.
+Room = Callable[[int], memoryview]
+Data = TypeVar("Data", bytes, memoryview)
+
+
 class StoreError(OSError):
     """The place that a URL names cannot be read as an archive's store; the message says why."""
 
@@ -64,8 +69,10 @@ class Store(Protocol):
     def sizes(self, prefix: str, keys: Iterable[str]) -> Iterator[int | None]:
         """Stored size in bytes of each key below `prefix`, None where there is no such key."""
 
-    def read(self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False) -> bytes:
-        """Bytes [start, start + size) of a value, all of it where `size` is None.
+    def read(
+        self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False, room: Room | None = None
+    ) -> bytes | memoryview:
+        """Bytes [start, start + size) of a value, all of it where `size` is None; in `room` if they are here.
 
         Raises
         ------
@@ -76,10 +83,20 @@ class Store(Protocol):
         """
 
 
-def _exact(data: bytes, size: int, key: str) -> bytes:
+def _exact(data: Data, size: int, key: str) -> Data:
     if len(data) != size:
         raise StoreError(f"{key} ends after {len(data)} of {size} bytes")
     return data
+
+
+def _read(file: BinaryIO, size: int, key: str, room: Room | None) -> bytes | memoryview:
+    """The next bytes of a file."""
+    if room is None:
+        return _exact(file.read(size), size, key)
+    place, done = room(size), 0
+    while done < size and (more := file.readinto(place[done:])):  # type: ignore[attr-defined]
+        done += more
+    return _exact(place[:done], size, key)
 
 
 @dataclass(frozen=True)
@@ -104,7 +121,9 @@ class FolderStore:
         """See :class:`Store`."""
         return (self._size(key) for key in keys)
 
-    def read(self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False) -> bytes:
+    def read(
+        self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False, room: Room | None = None
+    ) -> bytes | memoryview:
         """See :class:`Store`."""
         whole = self._size(key)
         if whole is None:
@@ -112,7 +131,7 @@ class FolderStore:
         size = whole - start if size is None else size
         with open(self._file(key), "rb") as file:
             file.seek(start)
-            return _exact(file.read(size), size, key)
+            return _read(file, size, key, room)
 
 
 @dataclass(frozen=True)
@@ -150,7 +169,9 @@ class RemoteStore:
         found = {path.removeprefix(f"{root}/"): entry.get("size") for path, entry in listed.items()}
         yield from (found.get(key) for key in keys)
 
-    def read(self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False) -> bytes:
+    def read(
+        self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False, room: Room | None = None
+    ) -> bytes | memoryview:
         """See :class:`Store`."""
         fs, root = self._open()
         return _remote_read(fs, f"{root}/{key}", key, start, size)
@@ -177,7 +198,9 @@ class ZipStore:
         """See :class:`Store`."""
         return (self.members[key].size if key in self.members else None for key in keys)
 
-    def read(self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False) -> bytes:
+    def read(
+        self, key: str, start: int = 0, size: int | None = None, *, verify: bool = False, room: Room | None = None
+    ) -> bytes | memoryview:
         """See :class:`Store`."""
         member = self.members.get(key)
         if member is None:
@@ -186,7 +209,11 @@ class ZipStore:
         size = member.size - start if size is None else size
         if start < 0 or size < 0 or start + size > member.size:
             raise StoreError(f"{key} holds {member.size} bytes, not {start + size}")
-        data = self._remote(key, member, start, size) if self.remote else self._local(key, member, start, size)
+        data: bytes | memoryview
+        if self.remote:
+            data = self._remote(key, member, start, size)
+        else:
+            data = self._local(key, member, start, size, room)
         if verify and whole and zlib.crc32(data) != member.checksum:
             raise StoreError("the zip file's checksum does not match: the stored bytes were changed")
         return data
@@ -197,12 +224,12 @@ class ZipStore:
         *_, name, extra = _LOCAL_HEADER.unpack(header[: _LOCAL_HEADER.size])
         return _LOCAL_HEADER.size + int(name) + int(extra)
 
-    def _local(self, key: str, member: _Member, start: int, size: int) -> bytes:
+    def _local(self, key: str, member: _Member, start: int, size: int, room: Room | None) -> bytes | memoryview:
         with open(self.url, "rb") as file:
             file.seek(member.offset)
             begin = self._begin(key, file.read(_LOCAL_HEADER.size))
             file.seek(member.offset + begin + start)
-            return _exact(file.read(size), size, key)
+            return _read(file, size, key, room)
 
     def _remote(self, key: str, member: _Member, start: int, size: int) -> bytes:
         fs, path = _file_system(self.url)

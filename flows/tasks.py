@@ -334,7 +334,7 @@ def _measure(task: BatchTask) -> Measurements:
         saturation=task.header.instrument.saturation,
     )
     return stages.measure(
-        frames(archive, window.start, window.stop),
+        frames(archive, window.start, window.stop, task.extraction.reference_frames),
         archive.time[window.start : window.stop],
         task.header,
         calibration,
@@ -351,12 +351,16 @@ def _keep(store: MeasurementStore, task: BatchTask, measured: Measurements) -> s
     return ""
 
 
-def frames(archive: Archive, start: int, stop: int) -> Iterator[NDArray[Any]]:
-    """Blocks of frames, tried again where a network failed and damage is not the reason."""
+def frames(archive: Archive, start: int, stop: int, together: int = 1) -> Iterator[NDArray[Any]]:
+    """Blocks of frames, tried again where a network failed and damage is not the reason.
+
+    Those that hold the last `together` frames stay as they are; memory of earlier ones is used again.
+    """
     tries = 0
+    keep = -(-(together - 1) // archive.chunk_frames) + 1
     while start < stop:
         try:
-            for first, block in archive.chunks(start, stop):
+            for first, block in archive.chunks(start, stop, keep=keep):
                 yield block
                 start, tries = first + len(block), 0
         except ChunkError as error:
