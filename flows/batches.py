@@ -49,16 +49,18 @@ class Batches:
 
     def __init__(self, plan: ArchivePlan, work: Work) -> None:
         self.plan, self.work = plan, work
-        self.done: dict[int, BatchResult] = {}
+        #: Why each finished batch failed; nothing where it did not. The results wait on the disk: memory stays flat.
+        self.done: dict[int, str] = {}
         self.frames_read = 0
         #: Whether the machine spoiled one.
         self.transient = False
         self._unstable: set[int] = set()
+        self._unkept: dict[int, BatchResult] = {}
         for window in plan.windows:
             finished = work.catalog.scratch.load(plan.result_key(window))
             if finished is None or (work.options.retry_failed and finished.quality_flag & FAILED):
                 continue
-            self.done[window.index] = finished
+            self.done[window.index] = finished.reason
             if finished.reason:
                 self._record(window, finished.reason)
         self.reused = len(self.done)
@@ -71,18 +73,13 @@ class Batches:
         """Batches that are not done."""
         return [window for window in self.plan.windows if window.index not in self.done]
 
-    def compute(self, model: Callable[[], Model]) -> list[BatchResult]:
+    def compute(self, model: Callable[[], Model]) -> None:
         """Compute what is not there.
 
         Parameters
         ----------
         model : callable
             Gives what turns correlations into profiles; not called where nothing is to be done.
-
-        Returns
-        -------
-        list of BatchResult
-            All batches, in their order.
         """
         if todo := self.todo:
             # The model travels with every batch: a few kB, and no worker that dies can take the only copy along.
@@ -93,7 +90,16 @@ class Batches:
                     self._take(outcome)
             for outcome in self._send(self.todo, made):
                 self._take(outcome)
-        return [self.done[window.index] for window in self.plan.windows]
+
+    def results(self) -> list[BatchResult]:
+        """All batches in their order, once they are computed."""
+        scratch, found = self.work.catalog.scratch, []
+        for window in self.plan.windows:
+            result = self._unkept.get(window.index) or scratch.load(self.plan.result_key(window))
+            if result is None:
+                raise RuntimeError(f"the kept result of batch {window.index} is gone; run again")
+            found.append(result)
+        return found
 
     def _without_correlations(self, todo: list[BatchWindow]) -> list[BatchWindow]:
         needed = {near.index: near for window in todo for near in self.plan.around(window)}
@@ -111,7 +117,7 @@ class Batches:
             reduced = self._reduced(near)
             if reduced is not None:
                 found.append(reduced)
-            elif not (near.index in self.done and self.done[near.index].quality_flag & FAILED):
+            elif not self.done.get(near.index):
                 raise RuntimeError(f"the kept correlations of batch {near.index} are gone; run again")
         return tuple(found)
 
@@ -152,9 +158,11 @@ class Batches:
         self.transient |= outcome.transient
         if outcome.transient or not outcome.lasting:
             self._unstable.add(window.index)
-        if not any(near.index in self._unstable for near in self.plan.around(window)):
+        if any(near.index in self._unstable for near in self.plan.around(window)):
+            self._unkept[window.index] = result
+        else:
             work.catalog.scratch.save(plan.result_key(window), result)
-        self.done[window.index] = result
+        self.done[window.index] = result.reason
         if result.reason:
             self._record(window, f"transient: {result.reason}" if outcome.transient else result.reason)
         work.progress.advanced(plan.name, window.index, result.reason)

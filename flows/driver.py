@@ -324,20 +324,19 @@ def _process(plan: ArchivePlan, work: Work) -> ArchiveOutcome:
     batches = Batches(plan, work)
     work.progress.planned(plan.name, len(batches.todo))
     log.info("%d of %d batches to compute", len(batches.todo), len(plan.windows))
-    results = batches.compute(lambda: model_of(plan, work))
-    faults = tuple(
-        f"{plan.name}: batch {number}: {result.reason}" for number, result in enumerate(results) if result.reason
-    )
+    batches.compute(lambda: model_of(plan, work))
+    spoiled = sorted((number, reason) for number, reason in batches.done.items() if reason)
+    faults = tuple(f"{plan.name}: batch {number}: {reason}" for number, reason in spoiled)
     counts: dict[str, Any] = {
-        "batches": len(results),
+        "batches": len(batches.done),
         "failed_batches": len(faults),
         "reused": batches.reused,
         "frames_read": batches.frames_read,
     }
-    if len(faults) == len(results) or batches.transient:
+    if len(faults) == len(batches.done) or batches.transient:
         # What the machine spoiled may succeed next time; what the data forbid never will.
         return ArchiveOutcome(plan.url, plan.name, "failed", faults=faults, input_fault=not batches.transient, **counts)
-    header = plan.header
+    header, results = plan.header, batches.results()
     dataset = assemble(
         results,
         description.describe(model_of(plan, work), header) | surroundings.compared(results),
