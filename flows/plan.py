@@ -12,7 +12,7 @@ from ..pipeline import batch as stages
 from ..pipeline import description
 from ..pipeline.lineage import Key, checkout, make_key
 from ..pipeline.parameters import SOURCES_USED
-from ..pipeline.units import safe
+from ..pipeline.units import safe, text
 from .patience import patiently, unreachable
 from .settings import InputError
 from .surroundings import surroundings_of, with_heights
@@ -252,6 +252,14 @@ def plan_archive(url: str, settings: Settings) -> ArchivePlan:
         plugins={"sources": [source.identity() for source in sources], "spectrum": spectrum.identity()},
         mark=mark,
     )
+    if configuration.batch.duration * instrument.frame_rate < 1:
+        # Their number would be bounded by nothing.
+        raise InputError(
+            [
+                f"{settings.origin}: batch.duration = '{text(configuration.batch.duration, 's')}': shorter than one "
+                f"frame of {origin} ({text(instrument.frame_rate, 'Hz')}); write for example '3 min'"
+            ]
+        )
     windows = tuple(batch_windows(archive.time, instrument.frame_rate, configuration.batch))
     surroundings = surroundings_of(header, grid, settings, windows[0].start_time, windows[-1].stop_time)
     profile = make_key(

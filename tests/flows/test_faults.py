@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import subprocess
+import tracemalloc
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -207,6 +208,54 @@ def test_too_few_frames_is_said_and_kept(recordings: list[str], tmp_path: Path) 
     assert all("43 frames are too few" in fault or "42 frames are too few" in fault for fault in outcome.faults)
     (again,) = run(settings, prefect=False)
     assert (again.status, again.frames_read, again.faults) == ("failed", 0, outcome.faults)
+
+
+def test_batches_without_end_are_refused(main_here: Call, recordings: list[str], tmp_path: Path) -> None:
+    done = main_here("run", recordings[0], "--out", tmp_path / "out", "--no-prefect", "--set", "batch.duration=1 ns")
+    assert done.code == 2
+    assert "batch.duration = '1e-09 s': shorter than one frame" in done.err
+
+
+#: Metadata that would run code, or fill memory or time, if anybody believed it: file, change, words of the message.
+CRAFTED: dict[str, tuple[str, Callable[[dict], None], str]] = {
+    "more frames than there are": ("frames", lambda d: d.update(shape=[2**40, *d["shape"][1:]]), "chunks are missing"),
+    "frames of a terapixel": ("frames", lambda d: d.update(shape=[d["shape"][0], 2**20, 2**20]), "at most 4096 x 4096"),
+    "one chunk of all": (
+        "frames",
+        lambda d: d["chunk_grid"]["configuration"].update(chunk_shape=[10**7, *d["shape"][1:]]),
+        "at most 256 MiB are allowed",
+    ),
+    "time without end": ("time", lambda d: d.update(shape=[2**50]), "one time stamp per frame"),
+    "objects": ("frames", lambda d: d.update(data_type="object"), "must be uint8 or uint16 or int16 or float32"),
+    "pickles": (
+        "frames",
+        lambda d: d["codecs"].append({"name": "numcodecs.pickle", "configuration": {}}),
+        "this codec is not allowed",
+    ),
+}
+
+
+def test_crafted_archives_are_refused_before_anything_is_allocated(
+    main_here: Call, recordings: list[str], tmp_path: Path
+) -> None:
+    made = {}
+    for name, (array, change, words) in CRAFTED.items():
+        (tmp_path / name).mkdir()
+        archive = unpacked(recordings[0], tmp_path / name)
+        path = archive / array / "zarr.json"
+        document = json.loads(path.read_text())
+        change(document)
+        path.write_text(json.dumps(document))
+        made[archive] = words
+    tracemalloc.start()
+    done = main_here(*run_arguments([*map(str, made)], tmp_path / "out"))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert done.code == 2
+    for archive, words in made.items():
+        assert any(str(archive) in line and words in line for line in done.err.splitlines()), (archive, done.err)
+    assert most < 64 * 2**20
+    assert not products(tmp_path / "out")
 
 
 # --- the same through Prefect ------------------------------------------------------------------------------
