@@ -6,6 +6,8 @@ hides no other; two of one name are an error that names both distributions.
 
 from __future__ import annotations
 
+import os
+import sys
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
@@ -23,7 +25,7 @@ from .contract import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
 #: Kind of plugin -> (entry point group, base class, key in a campaign file).
 KINDS: dict[str, tuple[str, type[Plugin]]] = {
@@ -158,10 +160,32 @@ def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> Entries:
     PluginError
         Two distributions register the same name.
     """
-    group = KINDS[kind][0]
+    if points is None:
+        return Entries(_installed(kind, entry_points, _state_of_path()))
+    return _registered(kind, points)
+
+
+def _state_of_path() -> tuple[tuple[str, int], ...]:
+    """Folders that distributions are found in, with the time of their last change."""
+    state = []
+    for folder in sys.path:
+        try:
+            state.append((folder, os.stat(folder or ".").st_mtime_ns))
+        except OSError:
+            state.append((folder, 0))
+    return tuple(state)
+
+
+@lru_cache(maxsize=16)
+def _installed(kind: str, find: Callable[..., Iterable[EntryPoint]], state: object) -> Entries:
+    # Looking through all distributions takes tens of milliseconds, and a run asks half a dozen times.
+    return _registered(kind, find(group=KINDS[kind][0]))
+
+
+def _registered(kind: str, points: Iterable[EntryPoint]) -> Entries:
     found = Entries()
     faults = []
-    for point in sorted(entry_points(group=group) if points is None else points, key=lambda p: (p.name, p.value)):
+    for point in sorted(points, key=lambda p: (p.name, p.value)):
         entry = Entry(kind, point.name, _distribution(point), point)
         known = found.setdefault(point.name, entry)
         if known.point.value != point.value:
