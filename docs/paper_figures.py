@@ -16,6 +16,7 @@ FIGURES = HERE / "figures"
 #: File -> (kind, panel). The profile, the criterion and the sensitivity are those of the last batch, weak turbulence,
 #: as in the paper; the others of the first.
 PANELS = {
+    "paper-02-terrain": ("time", "height"),
     "paper-04-05-response": ("time", "response"),
     "paper-06-checks": ("first", "checks"),
     "paper-07-correlations": ("first", "correlations"),

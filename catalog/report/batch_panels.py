@@ -240,31 +240,86 @@ def describe_profile(dataset: Dataset, batch: int) -> str:
     return text + (f" {count} of the slices {'is' if count == 1 else 'are'} at the bound of zero." if count else "")
 
 
+def _one(dataset: Dataset, batch: int, kind: str) -> Maps | None:
+    """Map of one kind of a batch, None where it has none."""
+    if kind not in MAP_KINDS:
+        raise ValueError(f"kind = {kind!r}: there are {', '.join(MAP_KINDS)}")
+    return next((item for item in maps(dataset, batch) if item.kind == kind), None)
+
+
 def draw_correlation_map(
-    ax: Axes, dataset: Dataset, values: Floats, *, norm: Normalize, residual: bool = False, ticks: bool = True
-) -> AxesImage:
-    """Draw one correlation map, dy upward.
+    ax: Axes, dataset: Dataset, batch: int = 0, *, kind: str = "ii_auto", which: str = "measured"
+) -> Axes:
+    """Draw one correlation map of a batch with its scale, dy upward: µrad² of slopes, an index of scintillation.
 
     Parameters
     ----------
     ax : Axes
         Where to draw.
     dataset : Dataset
-        The product, for its separations.
-    values : ndarray of float64, (dy, dx)
-        The map; NaN is left blank.
-    norm : Normalize
-        Scale, common to the maps that are compared.
-    residual : bool
-        Use the diverging colour map, and put a sign where :data:`NOTABLE` is exceeded.
-    ticks : bool
-        Mark separations, in cm, on both axes.
+        A product.
+    batch : int
+        Number of the batch in the product.
+    kind : str
+        One of :data:`coslidar.pipeline.geometry.MAP_KINDS`.
+    which : str
+        "measured", "model", or "residual" (measured minus model in units of the error, with a sign beyond 3).
 
     Returns
     -------
-    AxesImage
-        The image, for a colour bar.
+    Axes
+        `ax`.
+
+    Raises
+    ------
+    ValueError
+        There is no such kind, or no such map of it.
     """
+    from matplotlib.colors import Normalize
+
+    if which not in ("measured", "model", "residual"):
+        raise ValueError(f"which = {which!r}: there are measured, model, residual")
+    item = _one(dataset, batch, kind)
+    if item is None:
+        return note(ax, "no correlation maps")
+    residual, unit = which == "residual", _MICRO if item.is_slope else 1.0
+    norm = Normalize(-2 * NOTABLE, 2 * NOTABLE) if residual else Normalize(*_range([item], unit))
+    values = item.residual if residual else getattr(item, which) * unit
+    image = _draw_map(ax, dataset, values, norm=norm, residual=residual)
+    ax.set_title(f"{KIND_TITLES[kind]}, {which}".replace("\n", ", "))
+    ax.set_xlabel("dx (cm)")
+    ax.set_ylabel("dy (cm)")
+    words = "errors" if residual else "µrad²" if item.is_slope else "index"
+    ax.figure.colorbar(image, ax=ax, fraction=0.05, pad=0.03, label=words)
+    return ax
+
+
+def draw_correlation_cut(ax: Axes, dataset: Dataset, batch: int = 0, *, kind: str = "ii_auto") -> Axes:
+    """Draw measured and modelled correlation of a batch along dy at dx = 0.
+
+    Parameters
+    ----------
+    ax, dataset, batch, kind
+        As for :func:`draw_correlation_map`.
+
+    Returns
+    -------
+    Axes
+        `ax`.
+    """
+    item = _one(dataset, batch, kind)
+    if item is None:
+        return note(ax, "no correlation maps")
+    _draw_cut(ax, dataset, item).set_xlabel("dy (cm)")
+    ax.set_ylabel(KIND_TITLES[kind].replace("\n", ", ") + (" (µrad²)" if item.is_slope else ""))
+    ax.legend()
+    return ax
+
+
+def _draw_map(
+    ax: Axes, dataset: Dataset, values: Floats, *, norm: Normalize, residual: bool = False, ticks: bool = True
+) -> AxesImage:
+    """Draw values of (dy, dx), NaN blank, with signs beyond :data:`NOTABLE` if they are a residual."""
     dy, dx = (np.asarray(dataset[name].values, dtype=np.float64) * 100 for name in ("dy", "dx"))
     half_y, half_x = ((axis[1] - axis[0]) / 2 if axis.size > 1 else 0.5 for axis in (dy, dx))
     image = ax.imshow(
@@ -286,7 +341,7 @@ def draw_correlation_map(
     return image
 
 
-def draw_correlation_cut(ax: Axes, dataset: Dataset, item: Maps) -> Axes:
+def _draw_cut(ax: Axes, dataset: Dataset, item: Maps) -> Axes:
     """Draw measured and modelled correlation along dy at dx = 0."""
     dy = np.asarray(dataset["dy"].values, dtype=np.float64) * 100
     middle = item.measured.shape[1] // 2
@@ -364,7 +419,7 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
                 ax = axes(x, rows[name], cell, cell)
                 residual = name == "residual"
                 values = item.residual if residual else getattr(item, name) * unit
-                image = draw_correlation_map(ax, dataset, values, norm=sigma if residual else norm, residual=residual,
+                image = _draw_map(ax, dataset, values, norm=sigma if residual else norm, residual=residual,
                                              ticks=False)  # fmt: skip
                 if name == "measured":
                     ax.set_title(KIND_TITLES[item.kind], fontsize=12, loc="center")
@@ -381,7 +436,7 @@ def compose_correlations(figure: Figure, dataset: Dataset, batch: int) -> None:
                 if item is group[-1] and residual:
                     extend = "both" if worst > spread else "neither"
                     scale(image, x + cell + 0.1, rows[name], rows[name] + cell, "errors", extend)
-            cut = draw_correlation_cut(axes(x, rows["cut"], cell, _CUT), dataset, item)
+            cut = _draw_cut(axes(x, rows["cut"], cell, _CUT), dataset, item)
             cut.set_xlabel("dy (cm)", labelpad=1)
             cut.set_ylim(low - 0.06 * (high - low), high + 0.08 * (high - low))
             cut.yaxis.set_major_formatter(_plain)

@@ -8,6 +8,7 @@ import numpy as np
 
 from ...pipeline.beam_heights import mean_separation
 from ...pipeline.comparison import Pair, Separation
+from .batch_panels import note
 from .reading import DAY, Floats, bounds, edges, listed, values
 from .style import BLUE, DIVERGING, GREEN, INK, MUTED, PAPER, PURPLE, RED, figure_style
 from .time_panels import _frame, _join, _visible, time_axis
@@ -237,6 +238,8 @@ def draw_slice_flux(ax: Axes, datasets: Dataset | Sequence[Dataset]) -> Axes:
         found = [values(one, name) for one in products]
         return _median(np.concatenate([part for part in found if part is not None and part.shape[1] == centre.size]))
 
+    if not any("sensible_heat_flux" in one for one in products):
+        return note(ax, "no heat flux")
     flux, interval = median("sensible_heat_flux"), median("sensible_heat_flux_interval_68")
     ax.stairs(flux, border, color=RED, lw=1.8, label="similarity, with 68 % interval", baseline=None)
     ax.vlines(centre, interval[:, 0], interval[:, 1], color=RED, lw=1.2)

@@ -34,7 +34,7 @@ def _response(dataset: Dataset, variable: str, kinds: tuple[str, ...], kind: str
     return np.asarray(whole[kinds.index(kind)] / np.diff(edges(dataset)))
 
 
-def draw_response(ax: Axes, dataset: Dataset, variable: str, kinds: tuple[str, ...], kind: str, label: str) -> Axes:
+def draw_response(ax: Axes, dataset: Dataset, kind: str = "ii_auto") -> Axes:
     """Draw the auto-correlation that each slice makes along y at dx = 0, for Cn2 dz = 1 in it.
 
     Parameters
@@ -43,18 +43,25 @@ def draw_response(ax: Axes, dataset: Dataset, variable: str, kinds: tuple[str, .
         Where to draw.
     dataset : Dataset
         A product.
-    variable, kinds, kind : str, tuple of str, str
-        Which map: variable, its kinds, and one of them.
-    label : str
-        What the map is of.
+    kind : str
+        "ii_auto" for scintillation, "xx_auto" for slopes along x.
 
     Returns
     -------
     Axes
         `ax`, with one line a slice.
+
+    Raises
+    ------
+    ValueError
+        There is no such kind.
     """
     from matplotlib import colormaps
 
+    known = {item[2]: item for item in _AUTO}
+    if kind not in known:
+        raise ValueError(f"kind = {kind!r}: there are {', '.join(known)}")
+    variable, kinds, _, label = known[kind]
     found = _response(dataset, variable, kinds, kind)
     if found is None or not np.isfinite(found).any():
         return note(ax, "no response functions")
@@ -105,7 +112,7 @@ def compose_response(figure: Figure, datasets: Sequence[Dataset]) -> None:
     """Lay out responses of scintillation and slopes, and the sensitivity against distance."""
     dataset = _described(datasets)
     for place, item in zip(((0.115, 0.575, 0.375, 0.36), (0.605, 0.575, 0.375, 0.36)), _AUTO, strict=True):
-        draw_response(figure.add_axes(place), dataset, *item)
+        draw_response(figure.add_axes(place), dataset, item[2])
     draw_sensitivity(figure.add_axes((0.115, 0.1, 0.865, 0.32)), dataset)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,19 +56,22 @@ def serve(campaigns: tuple[Path, ...], every: str, name: str) -> None:
 
     Example:  coslidar serve campaign.toml --every "10 min"
 
-    With PREFECT_API_URL the runs show on that server, else on one that lives as long as this command.
+    With PREFECT_API_URL the runs show on that server, else on one that lives as long as this command. Ctrl-C ends it.
     """
     from ..deployment import deployment
     from ..deployment import serve as listen
+    from ..progress import counted
     from ..server import server
 
     seconds = _seconds(every)
-    with server(schedules=True) as ready:
+    # An interrupt is how it is meant to end.
+    with suppress(KeyboardInterrupt), server(schedules=True) as ready:
         url = ready()
         made = deployment(campaigns, name, seconds)
         when = "started by hand" if seconds is None else f"every {every}"
-        click.echo(f"coslidar: serving {len(campaigns)} campaigns, {when}; Prefect API at {url}", err=True)
+        click.echo(f"coslidar: serving {counted(len(campaigns), 'campaign')}, {when}; Prefect API at {url}", err=True)
         listen(made)
+    click.echo("coslidar: serving no more; what was finished is kept", err=True)
 
 
 @click.command()

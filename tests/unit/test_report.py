@@ -332,9 +332,47 @@ def test_odd_profiles_are_drawn(cn2: np.ndarray) -> None:
     assert (ink(report.figure(report.BATCH_PANELS[0], dataset)) != 255).any()
 
 
+@pytest.mark.parametrize("name", [name for name in report.__all__ if name.startswith("draw_")])
+def test_what_draws_takes_axes_and_a_product_and_returns_the_axes(name: str) -> None:
+    """As somebody with a notebook would call it; what a product lacks is said in the axes."""
+    from matplotlib.figure import Figure
+
+    draw = getattr(report, name)
+    for dataset in (product(3), product(1)[["time_bounds", "z_bounds", "cn2"]]):
+        ax = Figure().add_subplot()
+        assert draw(ax, dataset) is ax
+        if "response_slope" in dataset:
+            assert ax.lines or ax.images or ax.collections or ax.patches or ax.texts
+
+
+def test_maps_of_every_kind_are_drawn_with_their_unit() -> None:
+    from matplotlib.figure import Figure
+
+    dataset = product(2)
+    for kind in ("xx_auto", "yy_cross", "ii_auto"):
+        for which in ("measured", "model", "residual"):
+            ax = report.draw_correlation_map(Figure().add_subplot(), dataset, 1, kind=kind, which=which)
+            shown = np.ma.filled(ax.images[0].get_array(), np.nan)
+            side, number = {"xx_auto": ("slope", 0), "yy_cross": ("slope", 3), "ii_auto": ("intensity", 0)}[kind]
+            measured, model, error = (
+                dataset[f"{side}_correlation{part}"].values[1, number] for part in ("", "_model", "_error")
+            )
+            expected = {"measured": measured, "model": model, "residual": (measured - model) / error}
+            factor = 1e12 if side == "slope" and which != "residual" else 1
+            np.testing.assert_allclose(shown, factor * expected[which], rtol=1e-12)
+    with pytest.raises(ValueError, match="there are xx_auto"):
+        report.draw_correlation_map(Figure().add_subplot(), dataset, kind="zz")
+    with pytest.raises(ValueError, match="there are measured"):
+        report.draw_correlation_map(Figure().add_subplot(), dataset, which="error")
+    with pytest.raises(ValueError, match="there are ii_auto, xx_auto"):
+        report.draw_response(Figure().add_subplot(), dataset, "yy_cross")
+
+
 def test_dy_points_upward_in_the_maps() -> None:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
+
+    from coslidar.catalog.report import batch_panels
 
     dataset = product(1)
     values = np.zeros((9, 9))
@@ -342,7 +380,7 @@ def test_dy_points_upward_in_the_maps() -> None:
     with report.figure_style():
         figure = Figure(figsize=(3, 3))
         ax = figure.add_axes((0, 0, 1, 1))
-        report.draw_correlation_map(ax, dataset, values, norm=Normalize(0, 1), ticks=False)
+        batch_panels._draw_map(ax, dataset, values, norm=Normalize(0, 1), ticks=False)
     bright = np.argwhere((ink(figure)[..., 0] > 200) & (ink(figure)[..., 2] < 100))
     rows, columns = bright.mean(axis=0) / 180
     assert rows < 0.15
