@@ -27,10 +27,10 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import ndimage
 
 from .bad_pixels import no_bad_pixels
 from .refinement import refine
+from .shifts import Splines
 from .spots import FLAGS, Calibration, SpotLayout, eights
 from .window_kernel import window_kernel
 
@@ -56,7 +56,11 @@ _NUMPY_TYPES = (np.uint8, np.uint16, np.int16, np.float32)
 
 
 def extract(
-    frames: NDArray[Any], layout: SpotLayout, calibration: Calibration, parameters: ExtractionParameters
+    frames: NDArray[Any],
+    layout: SpotLayout,
+    calibration: Calibration,
+    parameters: ExtractionParameters,
+    out: tuple[Floats, Floats, NDArray[np.uint8]] | None = None,
 ) -> tuple[Floats, Floats, NDArray[np.uint8]]:
     """Slopes and fluxes of every source and subaperture in each frame.
 
@@ -72,6 +76,8 @@ def extract(
         The calibration that `layout` was made with.
     parameters : ExtractionParameters
         The parameters that `layout` was made with.
+    out : tuple of ndarray, optional
+        Where to put what is returned.
 
     Returns
     -------
@@ -93,9 +99,10 @@ def extract(
         raise ValueError(f"frames of type {frames.dtype}: uint8, uint16, int16 or float32 are read")
     frames = np.ascontiguousarray(frames)
     n_sources, n_boxes = layout.flux.shape
-    slopes = np.empty((len(frames), 2, n_sources, n_boxes))
-    flux = np.empty((len(frames), n_sources, n_boxes))
-    flag = np.empty((len(frames), n_sources, n_boxes), dtype=np.uint8)
+    if out is None:
+        shape = (len(frames), n_sources, n_boxes)
+        out = np.empty((len(frames), 2, n_sources, n_boxes)), np.empty(shape), np.empty(shape, dtype=np.uint8)
+    slopes, flux, flag = out
     rows, cols = layout.pitch
     tall, wide = (int(side) for side in layout.window)
     usual, across = layout.usual
@@ -135,7 +142,7 @@ def extract(
         zero = np.moveaxis(layout.spots, -1, 0)[::-1]
         position = slopes / layout.pixel_scale + zero
         refine(frames, layout, parameters, position, flux, flag)
-        slopes = (position - zero) * layout.pixel_scale
+        slopes[...] = (position - zero) * layout.pixel_scale
     return slopes, flux, flag
 
 
@@ -166,11 +173,10 @@ def response_to_tilt(
     moves = np.linspace(-reach, reach, steps)
     gain = np.empty((2, len(layout.centre)))
     for source, (template, centre) in enumerate(zip(layout.template, layout.centre, strict=True)):
+        spline = Splines(template[None])
         for axis in range(2):
-            step = (0.0, 1.0) if axis == 0 else (1.0, 0.0)
-            boxes = np.stack(
-                [ndimage.shift(template, np.multiply(step, move), order=3, mode="nearest") for move in moves]
-            )
+            step = np.array((0.0, 1.0) if axis == 0 else (1.0, 0.0))
+            boxes = np.stack([spline.moved(0, step * move) for move in moves])
             spots = np.repeat(layout.centre[:, None, :], len(boxes), axis=1)
             found, _ = measure_boxes(replace(layout, spots=spots), boxes, parameters)
             gain[axis, source] = np.polyfit(moves, found[source, :, 1 - axis] - centre[1 - axis], 1)[0]

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
-from scipy.interpolate import BSpline
 
+from .shifts import cubic_taps
 from .spots import WING_STEP
 
 if TYPE_CHECKING:
@@ -98,7 +98,6 @@ def wings(spots: Floats, layout: SpotLayout, reach: float) -> tuple[NDArray[np.f
     middle = spots.shape[1] // 2
     steps = np.arange(-middle, middle + 1.0)
     places = np.arange(-reach, reach + WING_STEP / 2, WING_STEP)
-    cubic = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
     covers = [_cover(steps, side) for side in layout.window]
     weights = [np.stack([cover, cover * steps]) for cover in covers]
     table = np.empty((2, len(places), len(places), 3), dtype=np.float32)
@@ -107,13 +106,23 @@ def wings(spots: Floats, layout: SpotLayout, reach: float) -> tuple[NDArray[np.f
         apart = layout.centre[1 - source] - layout.centre[source]
         start[source] = apart + places[0]
         spline = ndimage.spline_filter(spots[1 - source], order=3)
-        rows, cols = (
-            np.stack([weight @ np.nan_to_num(cubic(steps[:, None] - steps - (middle + place))) for place in places])
-            for middle, weight in zip(apart, weights, strict=True)
-        )
-        sums = np.einsum("mar,rc,nbc->mnab", rows, spline, cols, optimize=True)
-        table[source] = np.stack([sums[..., 0, 0], sums[..., 1, 0], sums[..., 0, 1]], axis=-1)
+        rows, cols = (_under(weight, middle + places) for middle, weight in zip(apart, weights, strict=True))
+        sums = np.tensordot(rows @ spline, cols, (2, 2))  # place, moment of rows, place, moment of columns
+        table[source] = np.stack([sums[:, 0, :, 0], sums[:, 1, :, 0], sums[:, 0, :, 1]], axis=-1)
     return table, start
+
+
+def _under(weight: Floats, shift: Floats) -> Floats:
+    """Sums of weights (2, n) under the cubic B-spline of each coefficient that is moved by each shift, (m, 2, n)."""
+    size = weight.shape[1]
+    at = np.arange(size) + shift[:, None]
+    first = np.floor(at).astype(np.int64) - 1
+    taps = cubic_taps(at - np.floor(at))
+    padded = np.pad(weight, ((0, 0), (1, 1)))  # nothing beyond the ends
+    total = np.zeros((2, *at.shape))
+    for number, tap in enumerate(taps):
+        total += tap * padded[:, np.clip(first + number, -1, size) + 1]
+    return np.asarray(total.transpose(1, 0, 2))
 
 
 def window_response(spots: Floats, layout: SpotLayout) -> Floats:

@@ -62,7 +62,7 @@ class _Reference:
     def _find(self, frames: list[NDArray[Any]], **known: Any) -> SpotLayout:
         header, calibration, parameters = self._given
         try:
-            return layout(header, reference_image(np.concatenate(frames)), calibration, parameters, **known)
+            return layout(header, reference_image(*frames), calibration, parameters, **known)
         except ValueError as error:
             raise MeasurementError(str(error)) from error
 
@@ -130,7 +130,7 @@ def measure(
         start = done
         if reference is None:
             reference = _Reference(header, calibration, parameters, unit)
-            few = np.concatenate(unit)[: noise.FRAMES]
+            few = np.concatenate([piece[: noise.FRAMES] for piece in unit])[: noise.FRAMES]
             dark = noise.pixel_noise_variance(few, reference.layout, calibration)
         elif not reference.lit.all():
             reference.find_again(unit)
@@ -138,9 +138,8 @@ def measure(
             stop = done + len(piece)
             if stop > len(time):
                 break
-            slopes[done:stop], flux[done:stop], flag[done:stop] = extract(
-                piece, reference.layout, calibration, parameters
-            )
+            out = slopes[done:stop], flux[done:stop], flag[done:stop]
+            extract(piece, reference.layout, calibration, parameters, out)
             done = stop
         moved = _displacement(slopes[start:done:EVERY]) / header.instrument.pixel_scale
         if reference.shift.any():
@@ -212,6 +211,12 @@ def _units(blocks: Iterable[NDArray[Any]], size: int) -> Iterator[list[NDArray[A
 
 def _displacement(slopes: Floats) -> Floats:
     """Median over the spots of each source of their mean displacement, (2, S); NaN where half of them are not seen."""
+    if not len(slopes):
+        return np.full(slopes.shape[1:3], np.nan)
+    # The sum of a spot is finite exactly when no slope of it is missing: cheaper than looking at each.
+    mean = slopes.sum(axis=0) / len(slopes)
+    if np.isfinite(mean).all():
+        return np.asarray(np.median(mean, axis=-1))
     seen = np.isfinite(slopes)
     count = seen.sum(axis=0)
     mean = np.where(seen, slopes, 0.0).sum(axis=0) / np.maximum(count, 1)

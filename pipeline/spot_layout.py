@@ -13,6 +13,7 @@ from .bad_pixels import fill, light_on, no_bad_pixels, predictors
 from .extraction import REFINED, measure_boxes, search_region
 from .mean_spot import mean_spots, window_response, wings
 from .refinement import prepared
+from .shifts import Splines
 from .spots import FLAGS, Calibration, SpotLayout
 
 if TYPE_CHECKING:
@@ -36,13 +37,13 @@ ALONG = 0.9
 ACROSS = 6.6
 
 
-def reference_image(frames: NDArray[Any]) -> Floats:
+def reference_image(*frames: NDArray[Any]) -> Floats:
     """Mean of frames, from which the spots' positions are taken.
 
     Parameters
     ----------
-    frames : ndarray, (n, row, col)
-        Raw counts.
+    *frames : ndarray, (n, row, col)
+        Raw counts, in any number of pieces.
 
     Returns
     -------
@@ -53,9 +54,15 @@ def reference_image(frames: NDArray[Any]) -> Floats:
     ValueError
         There are no frames.
     """
-    if frames.ndim != 3 or not frames.size:
-        raise ValueError(f"frames of shape {frames.shape}: (time, row, col) with at least one frame is needed")
-    mean: Floats = np.mean(frames, axis=0, dtype=np.float64)
+    for piece in frames:
+        if piece.ndim != 3 or not piece.size:
+            raise ValueError(f"frames of shape {piece.shape}: (time, row, col) with at least one frame is needed")
+    if frames[0].dtype.kind in "ui":
+        # Sums of integers are exact, however they are cut.
+        total = sum(np.sum(piece, axis=0, dtype=np.int64) for piece in frames)
+        return np.asarray(total / sum(map(len, frames)))
+    whole = frames[0] if len(frames) == 1 else np.concatenate(frames)
+    mean: Floats = np.mean(whole, axis=0, dtype=np.float64)
     return mean
 
 
@@ -324,13 +331,9 @@ def _templates(filled: Floats, bad: NDArray[np.bool_], spots: Floats) -> tuple[F
     weight = 1.0 - np.stack([ndimage.binary_dilation(hole, iterations=1) for hole in bad]).astype(float)
     weight = np.maximum(weight, 1e-6)
     template = np.empty((len(spots), *filled.shape[1:]))
+    splines = Splines(filled)
     for source in range(len(spots)):
-        moved = np.stack(
-            [
-                ndimage.shift(box, centre[source] - spot, order=3, mode="nearest")
-                for box, spot in zip(filled, spots[source], strict=True)
-            ]
-        )
+        moved = np.stack([splines.moved(box, centre[source] - spot) for box, spot in enumerate(spots[source])])
         template[source] = (moved * weight).sum(axis=0) / weight.sum(axis=0)
     return template, centre
 
@@ -340,20 +343,23 @@ def _has_spot(filled: Floats, spots: Floats, window: tuple[float, float]) -> NDA
 
     Its core is well above the scatter of the box's dark part, and brighter than a wing of the other source.
     """
-    found = np.zeros(spots.shape[:2], dtype=bool)
     rows, cols = np.indices(filled.shape[1:])
-    for box, image in enumerate(filled):
-        inside = [
-            (np.abs(rows - row) < window[0] / 2) & (np.abs(cols - col) < window[1] / 2) for row, col in spots[:, box]
-        ]
-        outside = image[~np.any(inside, axis=0)]
-        level = float(np.median(outside))
-        scatter = 1.4826 * float(np.median(np.abs(outside - level)))
-        core = np.array(
-            [image[(np.abs(rows - row) <= 1.0) & (np.abs(cols - col) <= 1.0)].mean() for row, col in spots[:, box]]
-        )
-        found[:, box] = (core - level > 5.0 * scatter) & (core > level) & (core - level > WING * (core - level).max())
+    away = np.abs(np.stack([rows, cols], axis=-1) - spots[:, :, None, None])  # source, box, row, col, axis
+    outside = np.logical_not((away < np.array(window) / 2).all(axis=-1).any(axis=0))
+    level = _median(filled, outside)[:, None, None]
+    scatter = 1.4826 * _median(np.abs(filled - level), outside)
+    near = (away <= 1.0).all(axis=-1)
+    core = np.where(near, filled - level, 0.0).sum(axis=(2, 3)) / near.sum(axis=(2, 3))
+    found: NDArray[np.bool_] = (core > 5.0 * scatter) & (core > 0.0) & (core > WING * core.max(axis=0))
     return found
+
+
+def _median(values: Floats, used: NDArray[np.bool_]) -> Floats:
+    """Median of the used pixels of each box, (A,)."""
+    ordered = np.sort(np.where(used, values, np.inf).reshape(len(values), -1), axis=1)
+    count = used.reshape(len(values), -1).sum(axis=1)
+    middle = np.stack([(count - 1) // 2, count // 2], axis=1)
+    return np.asarray(np.take_along_axis(ordered, middle, axis=1).mean(axis=1))
 
 
 def _lowest_saturated(
