@@ -23,6 +23,9 @@ SIGNAL_KINDS = ("x", "y", "i")
 AUTO_MAP = tuple(MAP_KINDS.index(f"{kind}{kind}_auto") for kind in SIGNAL_KINDS)
 CROSS_MAP = tuple(MAP_KINDS.index(f"{kind}{kind}_cross") for kind in SIGNAL_KINDS)
 
+#: Frames whose products are summed at a time.
+_BLOCK = 1024
+
 
 @dataclass(frozen=True, eq=False)
 class CorrelationSums:
@@ -112,16 +115,20 @@ def channels(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> NDArra
     ValueError
         The shapes do not fit each other.
     """
-    if slopes.ndim != 4 or slopes.shape[1] != 2 or flux.shape != (slopes.shape[0], *slopes.shape[2:]):
-        raise ValueError(
-            "slopes must be (time, 2, source, subaperture) and flux (time, source, subaperture): "
-            f"got {slopes.shape} and {flux.shape}"
-        )
+    _check_shapes(slopes, flux)
     frames, _, sources, subapertures = slopes.shape
     samples = np.empty((frames, 3, sources, subapertures))
     samples[:, :2] = slopes
     samples[:, 2] = flux
     return samples.reshape(frames, 3 * sources * subapertures)
+
+
+def _check_shapes(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> None:
+    if slopes.ndim != 4 or slopes.shape[1] != 2 or flux.shape != (slopes.shape[0], *slopes.shape[2:]):
+        raise ValueError(
+            "slopes must be (time, 2, source, subaperture) and flux (time, source, subaperture): "
+            f"got {slopes.shape} and {flux.shape}"
+        )
 
 
 def accumulate(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> CorrelationSums:
@@ -145,42 +152,51 @@ def accumulate(slopes: NDArray[np.floating], flux: NDArray[np.floating]) -> Corr
     ValueError
         The shapes do not fit each other, or a sample is infinite.
     """
-    samples = channels(slopes, flux)
-    frames = samples.shape[0]
-    sources, subapertures = flux.shape[1:]
+    _check_shapes(slopes, flux)
+    frames, sources, subapertures = flux.shape
     if frames == 0:
         return CorrelationSums.empty(sources, subapertures)
-    shape = (samples.shape[1],) * 2
-    # The sum of a column is finite exactly when no sample of it is NaN: cheaper than looking at every sample.
-    mean = samples.mean(axis=0)
-    if np.all(np.isfinite(mean)):
-        samples -= mean
-        return CorrelationSums(
-            sources,
-            subapertures,
-            frames,
-            np.full(shape, frames, np.int64),
-            np.repeat(mean[:, None], shape[0], axis=1),
-            samples.T @ samples,
-        )
-    if np.any(np.isinf(samples)):
+    kinds = slopes.reshape(frames, -1), flux.reshape(frames, -1)
+    parts = slice(None, kinds[0].shape[1]), slice(kinds[0].shape[1], None)
+    size = kinds[0].shape[1] + kinds[1].shape[1]
+    # The sum of a frame is finite exactly when no sample of it is missing: cheaper than looking at every sample.
+    gaps = ~np.isfinite(sum(kind.sum(axis=1) for kind in kinds))
+    partial = channels(slopes[gaps], flux[gaps])
+    if np.any(np.isinf(partial)):
         raise ValueError("a slope or flux is infinite: NaN alone stands for a sample that was not measured")
-    measured = np.isfinite(samples)
-    presence = measured.astype(np.float64)
+    measured = np.isfinite(partial)
+    whole = frames - len(partial)
     # Sums are taken about each channel's own mean, so that subtracting the pairwise means below cancels
     # nothing.
-    origin = np.where(measured, samples, 0.0).sum(axis=0) / np.maximum(presence.sum(axis=0), 1)
-    deviation = np.where(measured, samples - origin, 0.0)
-    count = presence.T @ presence
-    total = deviation.T @ presence
-    offset = total / np.maximum(count, 1)
+    seen = whole + measured.sum(axis=0)
+    origin = np.where(measured, partial, 0.0).sum(axis=0)
+    for kind, part in zip(kinds, parts, strict=True):
+        origin[part] += np.sum(kind, axis=0, dtype=np.float64, where=~gaps[:, None] if gaps.any() else True)
+    origin /= np.maximum(seen, 1)
+    comoment = np.zeros((size, size))
+    total = np.zeros(size)
+    room = np.empty((min(frames, _BLOCK), size))
+    # Some frames at a time, which stay in the processor's cache.
+    for start in range(0, frames, _BLOCK):
+        deviation = room[: min(frames - start, _BLOCK)]
+        for kind, part in zip(kinds, parts, strict=True):
+            np.subtract(kind[start : start + _BLOCK], origin[part], out=deviation[:, part])
+        deviation[gaps[start : start + _BLOCK]] = 0.0
+        comoment += deviation.T @ deviation
+        total += deviation.sum(axis=0)
+    presence = measured.astype(np.float64)
+    deviation = np.where(measured, partial - origin, 0.0)
+    count = whole + presence.T @ presence
+    sums = total[:, None] + deviation.T @ presence
+    offset = sums / np.maximum(count, 1)
+    comoment += deviation.T @ deviation
     return CorrelationSums(
         sources,
         subapertures,
         frames,
         np.rint(count).astype(np.int64),
         np.where(count > 0, origin[:, None] + offset, 0.0),
-        deviation.T @ deviation - offset * total.T,
+        comoment - offset * sums.T,
     )
 
 
