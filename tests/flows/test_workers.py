@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import subprocess
 import sys
@@ -16,9 +17,12 @@ from small_runs import BATCHES, FRAMES, SETTINGS, Finished, environment, product
 
 from coslidar.catalog import open_catalog
 from coslidar.flows import tasks
+from coslidar.flows.batches import Batches
 from coslidar.flows.options import Options
+from coslidar.flows.plan import BatchWindow
 from coslidar.flows.run import run
 from coslidar.flows.settings import load
+from coslidar.pipeline.batch import Model
 from coslidar.pipeline.products import QUALITY_FLAGS
 
 Call = Callable[..., Finished]
@@ -127,6 +131,39 @@ def test_a_batch_that_kills_its_workers_is_recorded_and_the_others_are_done(
     )
     assert (mended.status, mended.failed_batches, mended.frames_read) == ("published", 0, FRAMES // BATCHES)
     assert set(products(out).values()) >= set(undisturbed.values())
+
+
+def test_what_travels_is_small_however_long_a_batch_is(
+    recordings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In bytes, as Dask sends them: frames stay where they are, and so do slopes."""
+    sent: list[int] = []
+    back: list[int] = []
+    task, take = Batches._task, Batches._take
+
+    def sending(self: Batches, window: BatchWindow, model: Model | None) -> tasks.BatchTask:
+        made = task(self, window, model)
+        sent.append(len(pickle.dumps((made, model))))
+        return made
+
+    def taking(self: Batches, outcome: tasks.BatchOutcome) -> None:
+        back.append(len(pickle.dumps(outcome)))
+        take(self, outcome)
+
+    monkeypatch.setattr(Batches, "_task", sending)
+    monkeypatch.setattr(Batches, "_take", taking)
+    most = {}
+    for length in ("1.5 s", "6 s"):
+        sets = [*SETTINGS, f"batch.duration={length}"]
+        (outcome,) = run(load(archives=recordings[:1], output=tmp_path / length, assignments=sets), prefect=False)
+        assert outcome.status == "published"
+        most[length] = (max(sent), max(back))
+        sent.clear()
+        back.clear()
+    assert most["6 s"][0] < 64 * 2**10
+    # Four times the frames, whose slopes alone would be 852 x 9 lenslets x 3 numbers x 2 sources x 8 bytes more.
+    assert most["6 s"][1] < most["1.5 s"][1] + 2**10
+    assert most["6 s"][1] < 256 * 2**10
 
 
 # --- records -----------------------------------------------------------------------------------------------
