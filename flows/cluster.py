@@ -150,6 +150,19 @@ def connect(run: RunParameters) -> Iterator[Client]:
             yield client
         finally:
             client.close()
+            _let_go()
+
+
+def _let_go() -> None:
+    """Forget the schedulers and workers of this process that are closed.
+
+    distributed remembers for every handler it ever called whether that takes a connection, and keeps with the handler
+    whom it belongs to; a service that runs again and again would keep them all.
+    """
+    from distributed import core
+
+    if (remembered := getattr(core, "_expects_comm", None)) is not None:
+        remembered.cache_clear()
 
 
 def _elsewhere(run: RunParameters, made: ExitStack) -> Client:
