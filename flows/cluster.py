@@ -36,6 +36,8 @@ def _settings() -> dict[str, Any]:
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.tick.limit": "60s",
         "distributed.worker.memory.terminate": 0.95,
+        # Its samples of a quarter of an hour are a hundred MB that nobody looks at.
+        "distributed.worker.profile.enabled": False,
         # Nobody looks at Dask's samples of what its threads do, a hundred a second.
         "distributed.worker.profile.enabled": False,
     }
