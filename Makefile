@@ -7,7 +7,7 @@ PIP    := $(BIN)/python -m pip --disable-pip-version-check
 export OMP_NUM_THREADS ?= 1
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: help demo test test-all test-postgresql docs bench bench-chain lint dev constraints clean
+.PHONY: help demo test test-all test-postgresql docs bench bench-chain soak lint dev constraints clean
 
 help:
 	@echo "make demo      install, simulate a small recording, profile it, draw a report"
@@ -15,6 +15,7 @@ help:
 	@echo "make test-all  the same with the slow science checks;  make test-postgresql: the catalog on a server of its own"
 	@echo "make docs      the documentation as pages, docs/_build/html/index.html"
 	@echo "make bench     every benchmark, as ratios;  make bench-chain: chain against reading"
+	@echo "make soak      runs for two hours (SOAK=10m: as long as you like): do memory and open files stay flat?"
 	@echo "make lint      ruff and mypy;  make dev: what an editor needs"
 
 $(VENV)/.python:
@@ -76,6 +77,10 @@ bench: $(VENV)/.test
 
 bench-chain: $(VENV)/.test
 	@$(BIN)/python benchmarks/bench_chain.py
+
+SOAK ?= 2h
+soak: $(VENV)/.test
+	@$(BIN)/python benchmarks/soak.py --for $(SOAK)
 
 lint: dev
 	@$(BIN)/ruff check .
