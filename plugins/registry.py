@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
@@ -166,14 +167,23 @@ def entries(kind: str, points: Iterable[EntryPoint] | None = None) -> Entries:
 
 
 def _state_of_path() -> tuple[tuple[str, int], ...]:
-    """Folders that distributions are found in, with the time of their last change."""
+    """Places that distributions are found in, with the time of their last change."""
     state = []
-    for folder in sys.path:
-        try:
-            state.append((folder, os.stat(folder or ".").st_mtime_ns))
-        except OSError:
-            state.append((folder, 0))
+    for place in sys.path:
+        with suppress(OSError):
+            changed = os.stat(place or ".").st_mtime_ns
+            if _holds_distributions(place, changed):
+                state.append((place, changed))
     return tuple(state)
+
+
+@lru_cache(maxsize=256)
+def _holds_distributions(place: str, changed: int) -> bool:
+    # Dask puts a new folder on the path for every run.
+    try:
+        return any(name.endswith((".dist-info", ".egg-info")) for name in os.listdir(place or "."))
+    except NotADirectoryError:
+        return True  # a zip file
 
 
 @lru_cache(maxsize=16)
