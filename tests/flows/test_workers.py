@@ -5,15 +5,18 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
+from urllib.request import HTTPCookieProcessor, build_opener
 
 import numpy as np
 import pytest
 from small_clusters import Cluster
-from small_runs import BATCHES, FRAMES, SETTINGS, Finished, environment, products, run_arguments, wait_for
+from small_runs import BATCHES, FRAMES, SETTINGS, Finished, command, environment, products, run_arguments, wait_for
 
 from coslidar.catalog import open_catalog
 from coslidar.flows import tasks
@@ -248,17 +251,21 @@ sys.addaudithook(hook)
 """
 
 
-def connections(tmp_path: Path, cache: Path, *arguments: object) -> list[str]:
-    """Every connection that a run and all its children ask the system for, and every name they look up."""
+def audited(tmp_path: Path, cache: Path) -> tuple[dict[str, str], Path]:
+    """Environment whose programs write down every connection and every name they look up; the file of it."""
     (tmp_path / "audit").mkdir()
     (tmp_path / "audit" / "sitecustomize.py").write_text(AUDIT)
     file = tmp_path / "connections.txt"
     file.touch()
+    return environment(cache, PYTHONPATH=str(tmp_path / "audit"), CONNECTIONS=str(file)), file
+
+
+def connections(tmp_path: Path, cache: Path, *arguments: object) -> list[str]:
+    """Every connection that a run and all its children ask the system for, and every name they look up."""
+    variables, file = audited(tmp_path, cache)
     done = subprocess.run(
-        [sys.executable, "-c", "from coslidar.flows.cli import main; main()", *map(str, arguments)],
-        capture_output=True, text=True, timeout=400, check=False, cwd=tmp_path,
-        env=environment(cache, PYTHONPATH=str(tmp_path / "audit"), CONNECTIONS=str(file)),
-    )  # fmt: skip
+        command(*arguments), capture_output=True, text=True, timeout=400, check=False, cwd=tmp_path, env=variables
+    )
     assert done.returncode == 0, done.stderr
     return file.read_text().splitlines()
 
@@ -269,21 +276,18 @@ HERE = re.compile(r"""socket\.\w+ (\('(127\.0\.0\.1|::1)', .*|'(127\.0\.0\.1|::1
 
 def test_the_audit_sees_what_it_should(tmp_path: Path, cache: Path) -> None:
     """A hook that hears nothing would pass everything."""
-    (tmp_path / "audit").mkdir()
-    (tmp_path / "audit" / "sitecustomize.py").write_text(AUDIT)
+    variables, file = audited(tmp_path, cache)
     code = (
         "import socket\nfor address in (('127.0.0.1', 9), ('192.0.2.1', 9)):\n"
         "    s = socket.socket()\n    s.settimeout(0.01)\n    s.connect_ex(address)\n"
         "try: socket.getaddrinfo('telemetry.invalid', 443)\nexcept OSError: pass\n"
     )
-    file = tmp_path / "seen"
-    subprocess.run(
-        [sys.executable, "-c", code],
-        check=True,
-        env=environment(cache, PYTHONPATH=str(tmp_path / "audit"), CONNECTIONS=str(file)),
-    )
+    subprocess.run([sys.executable, "-c", code], check=True, env=variables)
     seen = file.read_text().splitlines()
     assert [bool(HERE.fullmatch(line)) for line in seen] == [True, False, False], seen
+
+
+ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+\S*")
 
 
 def test_no_telemetry(recordings: list[str], tmp_path: Path, cache: Path) -> None:
@@ -296,3 +300,44 @@ def test_no_telemetry_of_prefect_and_its_server(recordings: list[str], tmp_path:
     found = connections(tmp_path, cache, *run_arguments(recordings[:1], tmp_path / "out", prefect=True))
     assert any("127.0.0.1" in line for line in found)  # flow and server speak with each other
     assert [line for line in found if not HERE.fullmatch(line)] == []
+
+
+@pytest.mark.cluster
+@pytest.mark.slow
+def test_no_telemetry_of_reports_pages_and_schedules(recordings: list[str], tmp_path: Path, cache: Path) -> None:
+    variables, file = audited(tmp_path, cache)
+    (tmp_path / "campaign.toml").write_text(
+        f"archives = ['{recordings[0]}']\n[batch]\nduration = '1.5 s'\n[response]\nslices = 6\n"
+    )
+    arguments = {
+        "serve": ("campaign.toml", "--every", "never"),
+        "run": ("campaign.toml", "--no-prefect"),
+        "report": ("campaign.toml", "-o", "report.html"),
+        "export": ("campaign.toml", "-o", "profiles.csv"),
+        "browse": ("campaign.toml", "--port", "0"),
+    }
+    for name, more in arguments.items():
+        with (tmp_path / f"{name}.txt").open("w") as said:
+            process = subprocess.Popen(
+                command(name, *more), stdout=said, stderr=said, cwd=tmp_path, env=variables, process_group=0
+            )
+        if name not in ("serve", "browse"):
+            assert process.wait(240) == 0, (tmp_path / f"{name}.txt").read_text()
+            continue
+        try:
+            assert wait_for(lambda log=tmp_path / f"{name}.txt": bool(ADDRESS.search(log.read_text())), 120, 0.1)
+            found = ADDRESS.search((tmp_path / f"{name}.txt").read_text())
+            assert found
+            if name == "browse":
+                reader = build_opener(HTTPCookieProcessor())  # the token of the address becomes a cookie
+                with reader.open(found[0], timeout=60) as answer:
+                    assert b"r0" in answer.read()
+            else:
+                time.sleep(3)  # what a server sends home it sends when it has come up
+            process.send_signal(signal.SIGINT)
+            assert process.wait(60) == 0
+        finally:
+            process.kill()
+    seen = file.read_text().splitlines()
+    assert any("127.0.0.1" in line for line in seen)
+    assert [line for line in seen if not HERE.fullmatch(line)] == []
