@@ -32,7 +32,7 @@ def _attributes(ctx: click.Context, parameter: click.Parameter, values: tuple[st
     "--format",
     "form",
     type=click.Choice(list(_ENDINGS)),
-    help="What to write.  [default: by the ending of the file, else csv]",
+    help="What to write.  [default: by the ending of the file; csv into a folder]",
 )
 @click.option(
     "-o",
@@ -68,10 +68,13 @@ def export(
     from ..chosen import choose
     from ..settings import InputError
 
-    if form is None:
-        form = next((name for name, ending in _ENDINGS.items() if output.suffix == f".{ending}"), "csv")
     if not output.is_dir() and not output.suffix:
         raise InputError([f"{output}: there is no such folder; make it first, or name a file with an ending"])
+    if form is None:
+        endings = {f".{ending}": name for name, ending in _ENDINGS.items()}
+        if not output.is_dir() and output.suffix not in endings:
+            raise InputError([f"{output}: no export ends so; write one of {', '.join(endings)}, or say --format"])
+        form = "csv" if output.is_dir() else endings[output.suffix]
     if form != "netcdf" and (cf_strict or attributes):
         raise InputError([f"--cf-strict and --attribute are for --format netcdf; {form} has neither"])
     try:

@@ -21,6 +21,8 @@ def existing(folder: Path, *, read_only: bool = False) -> Catalog:
     from ..settings import InputError
 
     if not is_catalog(folder):
+        if (campaign := folder / "campaign.toml").is_file():
+            raise InputError([f"{safe(str(folder))}: there is no catalog, but a campaign; name {safe(str(campaign))}"])
         raise InputError([f"{safe(str(folder))}: there is no catalog; 'coslidar run' makes one, --out names another"])
     try:
         return Catalog(folder, create=False, read_only=read_only)

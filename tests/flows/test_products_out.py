@@ -91,6 +91,7 @@ def test_strict_netcdf_and_attributes(file: Path, tmp_path: Path) -> None:
 def test_exports_that_are_refused(file: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.csv"
     assert "no such folder" in faults(export, file, "-o", tmp_path / "nowhere")[0]
+    assert "no export ends so; write one of .csv" in faults(export, file, "-o", tmp_path / "table.xlsx")[0]
     assert "for --format netcdf" in faults(export, file, "--cf-strict", "-o", out)[0]
     assert (
         "no attribute that a user gives"
