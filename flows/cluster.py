@@ -35,10 +35,11 @@ def _settings() -> dict[str, Any]:
     return {
         "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
         "distributed.admin.tick.limit": "60s",
+        # Dask looks fifty times a second whether it is late, and twice at its machine: nobody reads what it sees.
+        "distributed.admin.tick.interval": "1s",
+        "distributed.admin.system-monitor.interval": "5s",
         "distributed.worker.memory.terminate": 0.95,
         # Its samples of a quarter of an hour are a hundred MB that nobody looks at.
-        "distributed.worker.profile.enabled": False,
-        # Nobody looks at Dask's samples of what its threads do, a hundred a second.
         "distributed.worker.profile.enabled": False,
     }
 

@@ -56,8 +56,8 @@ class _Reference:
         self, header: Header, calibration: Calibration, parameters: ExtractionParameters, frames: list[NDArray[Any]]
     ) -> None:
         self._given = header, calibration, parameters
-        self.layout = self._find(frames)
-        self._zero = self.layout.spots
+        found = self._find(frames)
+        self._now(found, found.spots)
 
     def _find(self, frames: list[NDArray[Any]], **known: Any) -> SpotLayout:
         header, calibration, parameters = self._given
@@ -66,15 +66,12 @@ class _Reference:
         except ValueError as error:
             raise MeasurementError(str(error)) from error
 
-    @property
-    def lit(self) -> NDArray[np.bool_]:
-        """Sources whose spots are known, (S,)."""
-        return np.asarray(((self.layout.excluded & FLAGS["no_spot"]) == 0).mean(axis=1) >= LIT)
-
-    @property
-    def shift(self) -> Floats:
-        """From the zero of the slopes to the present place of the spots, (2, S, A), rad."""
-        return np.asarray((self.layout.spots - self._zero).transpose(2, 0, 1)[::-1] * self.layout.pixel_scale)
+    def _now(self, found: SpotLayout, zero: Floats) -> None:
+        self.layout, self._zero = found, zero
+        #: Sources whose spots are known, (S,).
+        self.lit = np.asarray(((found.excluded & FLAGS["no_spot"]) == 0).mean(axis=1) >= LIT)
+        #: From the zero of the slopes to the present place of the spots, (2, S, A), rad.
+        self.shift = np.asarray((found.spots - zero).transpose(2, 0, 1)[::-1] * found.pixel_scale)
 
     def find_again(self, frames: list[NDArray[Any]], moved: Floats | float = 0.0) -> None:
         """Find the spots on the mean of a unit; those that were not known have their zero there.
@@ -83,8 +80,8 @@ class _Reference:
         """
         known: dict[str, Any] = {"previous": self.layout, "moved": moved} if self.lit.any() else {}
         unknown = (self.layout.excluded & FLAGS["no_spot"]) > 0
-        self.layout = self._find(frames, **known)
-        self._zero = np.where(unknown[..., None], self.layout.spots, self._zero)
+        found = self._find(frames, **known)
+        self._now(found, np.where(unknown[..., None], found.spots, self._zero))
 
 
 def measure(
