@@ -92,6 +92,10 @@ def test_exports_that_are_refused(file: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.csv"
     assert "no such folder" in faults(export, file, "-o", tmp_path / "nowhere")[0]
     assert "no export ends so; write one of .csv" in faults(export, file, "-o", tmp_path / "table.xlsx")[0]
+    (tmp_path / "campaign.toml").write_text('campaign = "here"')
+    assert faults(export, tmp_path, "-o", out) == [
+        f"{tmp_path}: there is no catalog, but a campaign; name {tmp_path / 'campaign.toml'}"
+    ]
     assert "for --format netcdf" in faults(export, file, "--cf-strict", "-o", out)[0]
     assert (
         "no attribute that a user gives"
