@@ -96,6 +96,7 @@ def main(argv: list[str] | None = None) -> float:
         print(f"simulating {given.base} frames into {base} ...", flush=True)
         simulate_recording(base, given.base, codec="lz4")
     batch, highest = f"batch.duration={given.batch}", []
+    FOLDER.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(dir=FOLDER) as name:
         folder = Path(name)
         for frames in given.frames:
