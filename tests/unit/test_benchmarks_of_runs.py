@@ -16,7 +16,7 @@ RUNS = {
     "bench_scaling": (["--counts", "4", "8", "12"], "slope of log CPU time"),
     "bench_prefect": (
         ["--archives", "1", "--batches", "2", "--frames", "70", "--repeat", "1"],
-        "Prefect and Dask / bare",
+        "Prefect and Dask /",
     ),
     "bench_workers": (["--batches", "2", "--frames", "70", "--repeat", "1"], "gain of two threads"),
     "bench_memory": (["--frames", "568", "--base", "284", "--batch", "2 s"], "largest peak of resident memory"),
