@@ -2,8 +2,8 @@
 
 Prints the CPU and wall time of both, then what the CPU time of the chain went into, and on its last line the ratio of
 their CPU times. The chain is what `coslidar run --no-prefect` does in a process that is up: plan, read, extract,
-correlate, invert, draw the intervals, write the product, keep the books. Its modules are imported and its kernels loaded
-before anything is timed; so is the response matrix, which all runs of an instrument share.
+correlate, invert, draw the intervals, write the product, keep the books. Its modules are imported and its kernels
+loaded before anything is timed; so is the response matrix, which all runs of an instrument share.
 
     python benchmarks/bench_chain.py [--frames 25560 51120] [--codec lz4 zstd] [--repeat 3]
 """

@@ -18,6 +18,35 @@ if TYPE_CHECKING:
 CONVERGENCE = 0.3
 #: Bytes of frames that are measured box by box, together: a part of the second level cache of a core.
 GROUP = 2**19
+#: No nnan and no ninf: a pixel that is not a number must reach the tests of what was measured.
+_RELAXED = {"reassoc", "contract", "nsz", "arcp"}
+
+
+@njit(nogil=True, fastmath=_RELAXED, error_model="numpy")
+def repair(
+    box: Any,
+    frames: Any,
+    corner: Any,
+    frame_columns: Any,
+    cols: Any,
+    scale: Any,
+    offset: Any,
+    of_box: Any,
+    bad: Any,
+    neighbours: Any,
+    weights: Any,
+    begin: Any,
+    end: Any,
+) -> None:
+    """Predict the bad pixels of a box, of which a part may not be calibrated."""
+    for b in range(begin, end):
+        value = np.float32(0.0)
+        for m in range(neighbours.shape[1]):
+            if weights[b, m] != np.float32(0.0):
+                pixel = neighbours[b, m]
+                raw = np.float32(frames[corner + np.uint64(pixel // cols * frame_columns + pixel % cols)])
+                value += weights[b, m] * (raw * scale[np.uint64(of_box + pixel)] - offset[np.uint64(of_box + pixel)])
+        box[bad[b]] = value
 
 
 @lru_cache(maxsize=64)
@@ -45,8 +74,6 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
     From one pass to the next a window moves by a fraction of a pixel. The sums over its inner rows, column by column,
     are taken again only where it has come upon other rows.
     """
-    # No nnan and no ninf: a pixel that is not a number must reach the tests below.
-    relaxed = {"reassoc", "contract", "nsz", "arcp"}
     single, index = np.float32, np.uint64
     long: Any = np.int64
     half, one, none, nothing = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(-np.inf)
@@ -55,32 +82,7 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
     no_light, window_left, strayed = FLAGS["no_light"], FLAGS["window_left"], FLAGS["strayed"]
     not_converged, saturated = FLAGS["not_converged"], FLAGS["saturated"]
 
-    @njit(nogil=True, fastmath=relaxed, error_model="numpy")
-    def repair(
-        box: Any,
-        frames: Any,
-        corner: Any,
-        frame_columns: Any,
-        scale: Any,
-        offset: Any,
-        of_box: Any,
-        bad: Any,
-        neighbours: Any,
-        weights: Any,
-        begin: Any,
-        end: Any,
-    ) -> None:
-        """Predict the bad pixels of a box, of which a part may not be calibrated."""
-        for b in range(begin, end):
-            value = none
-            for m in range(neighbours.shape[1]):
-                if weights[b, m] != none:
-                    pixel = neighbours[b, m]
-                    raw = single(frames[corner + index(pixel // cols * frame_columns + pixel % cols)])
-                    value += weights[b, m] * (raw * scale[index(of_box + pixel)] - offset[index(of_box + pixel)])
-            box[bad[b]] = value
-
-    @njit(nogil=True, cache=True, fastmath=relaxed, error_model="numpy")
+    @njit(nogil=True, cache=True, fastmath=_RELAXED, error_model="numpy")
     def measure(
         frames: Any,
         n_frames: Any,
@@ -137,6 +139,7 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
                 low = usual[a, 0]
                 high = usual[a, 1]
                 left = usual[a, 2]
+                predictors = (scale, offset, a * rows * cols, bad_index, bad_neighbour, bad_weight)
                 for frame in range(begin, min(begin + together, n_frames)):
                     corner = index(frame) * index(frame_size) + index(first_pixel[a])
                     ahead = corner + index(frame_size + low * frame_columns + left)
@@ -152,21 +155,7 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
                         i += index(frame_columns)
                         j += index(cols)
                         o += index(cols)
-                    repair(
-                        *(
-                            box,
-                            frames,
-                            corner,
-                            frame_columns,
-                            scale,
-                            offset,
-                            a * rows * cols,
-                            bad_index,
-                            bad_neighbour,
-                            bad_weight,
-                        ),
-                        *(bad_start[a], bad_start[a + 1]),
-                    )
+                    repair(*(box, frames, corner, frame_columns, cols), *predictors, bad_start[a], bad_start[a + 1])
                     whole = False
                     for s in range(n_sources):
                         # Brightest pixel: largest of each column, then the column, then its row.
@@ -237,19 +226,10 @@ def window_kernel(cols: int, across: int, lanes: int, tall: int, wide: int) -> C
                                         j = index((a * rows + r) * cols)
                                         calibrate(frames, i, scale, offset, j, box, o, cols)
                                     repair(
-                                        *(
-                                            box,
-                                            frames,
-                                            corner,
-                                            frame_columns,
-                                            scale,
-                                            offset,
-                                            a * rows * cols,
-                                            bad_index,
-                                            bad_neighbour,
-                                            bad_weight,
-                                        ),
-                                        *(bad_start[a], bad_start[a + 1]),
+                                        *(box, frames, corner, frame_columns, cols),
+                                        *predictors,
+                                        bad_start[a],
+                                        bad_start[a + 1],
                                     )
                                 if outside:
                                     column = min(max(long(start) - spare, 0), max(cols - wide, 0))
