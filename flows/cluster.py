@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from ..pipeline.units import safe
 from .caches import cache_folder
 from .jobs import submitted, tls_security
+from .memory import few_heaps
 from .settings import InputError, Unavailable
 from .tasks import differences, versions
 
@@ -130,6 +131,7 @@ def connect(run: RunParameters) -> Iterator[Client]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     # Kernels release the GIL, so threads of one process use every core, start at once and share the archive.
     threads = run.threads or cores()
+    few_heaps(threads)
     with ExitStack() as made, dask.config.set(_settings()):
         if run.scheduler is None and run.jobs is None:
             client = Client(
