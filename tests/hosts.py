@@ -6,12 +6,25 @@ import os
 import shutil
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
 from small_runs import environment, family, wait_for
 
 BRIDGE = f"cos{os.getpid() % 100000}"
+#: What workers do beside: they count whose frames they have read. Dask imports it twice.
+COUNT = """
+from coslidar.flows import tasks
+if not hasattr(tasks, "counted"):
+    tasks.counted, honest = True, tasks._measure
+    def measure(task):
+        measured = honest(task)
+        with open({file!r}, "a") as out:
+            out.write(f"{{task.name}} {{task.window.index}}\\n")
+        return measured
+    tasks._measure = measure
+"""
 NETWORK = f"10.{77 + os.getpid() % 100}.{os.getpid() // 100 % 250}"
 
 
@@ -26,6 +39,9 @@ class Hosts:
         if shutil.which("ip") is None or os.geteuid() != 0:
             pytest.skip("hosts of a network need root and the command 'ip' (Debian: iproute2)")
         self.folder, self.cache = folder, cache
+        self._counted = folder / "counted"
+        self._counted.touch()
+        (folder / "count.py").write_text(COUNT.format(file=str(self._counted)))
         self.names = ["scheduler", *(f"worker{number}" for number in range(workers))]
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.address = f"tcp://{NETWORK}.10:8786"
@@ -67,7 +83,7 @@ class Hosts:
         else:
             program = [
                 "distributed.cli.dask_worker", self.address, "--host", here, "--no-dashboard", "--no-nanny",
-                "--nthreads", "1", "--local-directory", str(self.folder),
+                "--nthreads", "1", "--local-directory", str(self.folder), "--preload", str(self.folder / "count.py"),
             ]  # fmt: skip
         with (self.folder / f"{name}.log").open("ab") as log:
             self.processes[name] = subprocess.Popen(
@@ -77,6 +93,10 @@ class Hosts:
         if name == "scheduler":
             log_file = self.folder / "scheduler.log"
             assert wait_for(lambda: "Scheduler at" in log_file.read_text(), 60), log_file.read_text()
+
+    def measured(self) -> Counter[str]:
+        """How often the frames of each batch have been read to their end, on all hosts, by archive and batch."""
+        return Counter(self._counted.read_text().splitlines())
 
     def kill(self, name: str) -> None:
         """What a power cut does."""
