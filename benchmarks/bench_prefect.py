@@ -7,6 +7,7 @@ last line is the ratio of CPU times of Prefect and Dask to the bare loop: others
 
     python benchmarks/bench_prefect.py
     python benchmarks/bench_prefect.py --frames 70 --batches 300     the worst case: batches of 0.7 s, a minute of them
+    python benchmarks/bench_prefect.py --archives 1 --batches 10     a quick look
 """
 
 from __future__ import annotations
@@ -79,8 +80,8 @@ def main(argv: list[str] | None = None) -> float:
     """Run the benchmark and return the ratio of wall times."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--archives", type=int, default=4)
-    parser.add_argument("--batches", type=int, default=40, help="batches of an archive")
-    parser.add_argument("--frames", type=int, default=30 * FRAMES, help=f"frames of a batch, a multiple of {FRAMES}")
+    parser.add_argument("--batches", type=int, default=25, help="batches of an archive")
+    parser.add_argument("--frames", type=int, default=180 * FRAMES, help=f"frames of a batch, a multiple of {FRAMES}")
     parser.add_argument("--repeat", type=int, default=3)
     given = parser.parse_args(argv)
     parts = given.frames // FRAMES
