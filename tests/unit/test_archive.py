@@ -229,6 +229,14 @@ def test_every_layout_that_the_format_allows_is_read(tmp_path: Path, layout: dic
     assert chunk.flags.c_contiguous
     assert chunk.flags.writeable
     assert len(archive.identity) == 64
+    for keep in (1, 2):
+        held: list[tuple[int, np.ndarray]] = []
+        for found in archive.chunks(3, 38, keep=keep):
+            held = [*held, found][-keep:]
+            for first, block in held:
+                np.testing.assert_array_equal(block, frames[first : first + len(block)])
+                assert block.flags.c_contiguous
+                assert block.flags.writeable
 
 
 def test_an_infinite_path_is_read(tmp_path: Path) -> None:
@@ -254,6 +262,14 @@ def test_ranges_of_frames(small: Path) -> None:
         archive.read_chunk(3)
     with pytest.raises(IndexError):
         archive.read_chunk(-1)
+
+
+def test_memory_is_used_again_where_that_is_asked_for(small: Path) -> None:
+    archive = open_archive(small)
+    places = [block.ctypes.data for _, block in archive.chunks(0, 40, keep=2)]
+    assert places[2] == places[0] != places[1]
+    own = [block for _, block in archive.chunks(0, 40)]
+    assert len({block.ctypes.data for block in own}) == 3
 
 
 def test_gaps_are_found_and_told(tmp_path: Path) -> None:

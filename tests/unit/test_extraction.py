@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 from scipy.special import erf
 
 from coslidar.pipeline.extraction import FLAGS, Calibration, SpotLayout, extract, response_to_tilt
 from coslidar.pipeline.parameters import ExtractionParameters, Header
 from coslidar.pipeline.spot_layout import layout, reference_image
+from coslidar.pipeline.window_kernel import window_kernel
 
 Array = NDArray[Any]
 
@@ -646,3 +648,61 @@ def test_other_methods_on_everything_a_detector_does(method: Any, worst: float, 
     for part in (slice(0, 7), slice(7, 60)):
         for whole, cut in zip((slopes, flux, flag), extract(raw[part], found, calibration, parameters), strict=True):
             np.testing.assert_array_equal(whole[part], cut)
+
+
+# --- how it is computed changes nothing --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("margin", [-4.0, 0.0, 8.0])
+def test_the_part_that_is_calibrated_first_does_not_matter(margin: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    head = header()
+    frames, _, _ = recording(head, 60, 5, wander=1.2)
+    frames = frames.round().astype(np.uint16)
+    bad = np.random.default_rng(2).random(frames.shape[1:]) < 0.01
+    calibration = Calibration(dark=np.zeros(frames.shape[1:]), bad_pixel=bad)
+    found = prepare(head, frames, calibration, DEFAULT)
+    usual = extract(frames, found, calibration, DEFAULT)
+    monkeypatch.setattr("coslidar.pipeline.spots.USUAL", margin)
+    other = extract(frames, replace(found), calibration, DEFAULT)
+    assert not np.array_equal(replace(found).usual[0], found.usual[0])
+    # Sums in another order: float32 of a position of some 16 px.
+    np.testing.assert_allclose(other[0], usual[0], rtol=0, atol=1e-5 * SCALE)
+    np.testing.assert_allclose(other[1], usual[1], rtol=1e-5)
+    np.testing.assert_array_equal(other[2], usual[2])
+
+
+@pytest.mark.parametrize("width", [13, 20, 27])
+def test_boxes_of_any_width_are_calibrated_whole(width: int) -> None:
+    spot = ((10.2, (width - 1) / 2),)
+    head = header(spot, pitch=(21, width))
+    frames, _, _ = recording(head, 20, 3, wander=0.3, sigma=0.8)
+    flat = 1 + 0.1 * np.random.default_rng(1).standard_normal(frames.shape[1:])
+    calibration = Calibration(dark=np.full(flat.shape, 100.0), flat=flat)
+    raw = (frames * flat + 100).astype(np.float32)
+    found = prepare(head, raw, calibration, DEFAULT)
+    slopes, flux, flag = extract(raw, found, calibration, DEFAULT)
+    assert not flag.any()
+    place = absolute(slopes, found)
+    for t, a in ((0, 0), (7, 2), (19, 4)):
+        r, c = found.boxes[a]
+        row, col, light = by_hand(frames[t, r : r + 21, c : c + width], found, 0, a, DEFAULT)
+        assert place[t, :, 0, a] == pytest.approx([col, row], rel=1e-5)
+        assert flux[t, 0, a] == pytest.approx(light, rel=1e-4)
+
+
+def test_results_are_put_where_they_are_asked_for() -> None:
+    head = header()
+    frames, _, _ = recording(head, 10, 4)
+    found = prepare(head, frames.astype(np.float32), NO_CALIBRATION, DEFAULT)
+    own = extract(frames.astype(np.float32), found, NO_CALIBRATION, DEFAULT)
+    out = tuple(np.empty_like(array) for array in own)
+    assert extract(frames.astype(np.float32), found, NO_CALIBRATION, DEFAULT, out)[0] is out[0]
+    for one, other in zip(own, out, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_another_process_finds_the_kernel_in_the_cache() -> None:
+    # Numba's key holds what a closure refers to; of a compiled function that differs from process to process.
+    kernel: Any = window_kernel(32, 24, 8, 9, 24)
+    held = [cell.cell_contents for cell in kernel.py_func.__closure__]
+    assert not [value for value in held if isinstance(value, Dispatcher)]
