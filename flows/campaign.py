@@ -7,12 +7,14 @@ Results, retries and resuming are the catalog's business; Prefect's caching and 
 from __future__ import annotations
 
 from collections import Counter
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from prefect import flow, task
 from prefect.cache_policies import NO_CACHE
 from prefect.client.schemas.objects import State
+from prefect.concurrency.sync import concurrency
 from prefect.exceptions import CancelledRun, TerminationSignal
 from prefect.states import Cancelled, Completed, Failed
 from prefect.task_runners import ThreadPoolTaskRunner
@@ -28,14 +30,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 
-#: What a limit on the server bounds the archives in flight by, over all runs: prefect concurrency-limit create TAG N.
-TAG = "coslidar-archive"
+#: Limit on the server that bounds the archives in flight of all runs: prefect gcl create coslidar-archive --limit N.
+LIMIT = "coslidar-archive"
+#: How long to wait for a turn before looking whether the run is to stop; after how long a dead run loses its turn; s.
+TURN, LEASE = 5.0, 60.0
 
 
-@task(name="archive", task_run_name="{url}", tags={TAG}, cache_policy=NO_CACHE, persist_result=False)
+@task(name="archive", task_run_name="{url}", cache_policy=NO_CACHE, persist_result=False)
 def archive_task(url: str, work: Work) -> State[ArchiveOutcome]:
-    """Process one archive; its state says what became of it."""
-    outcome = process_archive(url, work)
+    """Process one archive when it is its turn; its state says what became of it."""
+    with ExitStack() as turn:
+        # Not a tag of the task: Prefect would wait for its turn for ever, and hear of no interrupt.
+        while not work.stopping.is_set():
+            try:
+                turn.enter_context(concurrency(LIMIT, timeout_seconds=TURN, lease_duration=LEASE))
+                break
+            except TimeoutError:
+                continue
+        outcome = process_archive(url, work)
     words = f"{outcome.status}: {outcome.batches - outcome.failed_batches} of {outcome.batches} batches"
     if outcome.status in ("refused", "failed"):
         return Failed(message="; ".join(outcome.faults)[:2000], data=outcome)

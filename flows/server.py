@@ -51,6 +51,8 @@ def quiet_environment() -> dict[str, str]:
         "PREFECT_SERVER_LOGGING_LEVEL": "CRITICAL",
         # What becomes of an archive is told once, by the driver.
         "PREFECT_LOGGING_LEVEL": "CRITICAL",
+        # That an archive has to wait for its turn is no error.
+        "PREFECT_LOGGING_INTERNAL_LEVEL": "CRITICAL",
         "PREFECT_LOGGING_TO_API_ENABLED": "false",
         "PREFECT_CLI_WRAP_LINES": "false",
         "PREFECT_RESULTS_PERSIST_BY_DEFAULT": "false",

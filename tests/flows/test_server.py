@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
@@ -19,6 +22,7 @@ from coslidar.flows import server
 from coslidar.flows.settings import Unavailable
 
 Call = Callable[..., Finished]
+Start = Callable[..., "subprocess.Popen[str]"]
 
 
 @pytest.fixture
@@ -124,26 +128,49 @@ def test_somebody_elses_server(kind: str, coslidar: Call, recordings: list[str],
 @pytest.mark.cluster
 @pytest.mark.slow
 def test_a_limit_on_the_server_holds_for_all_runs_together(
-    coslidar: Call, recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path, cache: Path
+    coslidar: Call, started: Start, recordings: list[str], undisturbed: dict[str, bytes], tmp_path: Path, cache: Path
 ) -> None:
+    (tmp_path / "sitecustomize.py").write_text(
+        "import time\nfrom coslidar.pipeline import batch\nhonest = batch.retrieve\n"
+        "batch.retrieve = lambda *a: (time.sleep(10), honest(*a))[1]\n"
+    )
     with prefect_server("sqlite", tmp_path, cache) as theirs:
-        theirs.prefect(cache, "concurrency-limit", "create", "coslidar-archive", "1")
-        with ThreadPoolExecutor(2) as pool:
-            runs = [
-                pool.submit(
-                    coslidar,
-                    *run_arguments(recordings, tmp_path / f"out{number}", prefect=True),
-                    PREFECT_API_URL=theirs.url,
-                )
-                for number in range(2)
-            ]
-            for done in (future.result() for future in runs):
-                assert done.code == 0, done.err
-        spans = sorted((one["start_time"], one["end_time"]) for one in theirs.all("task_runs"))
-        assert len(spans) == 6
-        # Although each run may have two archives in flight, there is one at a time in all.
-        assert all(before[1] <= after[0] for before, after in pairwise(spans)), spans
-    assert products(tmp_path / "out0") == products(tmp_path / "out1") == undisturbed
+        theirs.prefect(cache, "gcl", "create", "coslidar-archive", "--limit", "1")
+        first = tmp_path / "out0"
+        running = started(
+            *run_arguments(recordings, first, "--log-json", prefect=True),
+            PREFECT_API_URL=theirs.url,
+            PYTHONPATH=str(tmp_path),
+        )
+        assert wait_for(lambda: any((first / "correlations").glob("??/*.npz")) or running.poll() is not None, 120)
+        waiting = started(*run_arguments(recordings, tmp_path / "out1", prefect=True), PREFECT_API_URL=theirs.url)
+        # Two archives of each are on their way: one at work, three that wait for their turn.
+        assert wait_for(lambda: len(theirs.all("task_runs")) >= 4 or waiting.poll() is not None, 120, 0.2)
+        time.sleep(6)
+        waiting.send_signal(signal.SIGINT)
+        _, err = waiting.communicate(timeout=60)
+        assert waiting.returncode == 130, err
+        assert err == "coslidar: interrupted; what was finished is kept, the same command goes on from there\n"
+        done = coslidar(
+            *run_arguments(recordings, tmp_path / "out1", "--log-json", prefect=True), PREFECT_API_URL=theirs.url
+        )
+        assert done.code == 0, done.err
+        _, err = running.communicate(timeout=240)
+        assert running.returncode == 0, err
+    spans = sorted(_spans(done.err) + _spans(err))
+    assert len(spans) == 2 * len(recordings)
+    # Although each run may have two archives in flight, there is one at a time in all.
+    assert all(before[1] <= after[0] for before, after in pairwise(spans)), spans
+    assert products(first) == products(tmp_path / "out1") == undisturbed
+
+
+def _spans(log: str) -> list[tuple[str, str]]:
+    """When each archive of a run began and ended, of its records."""
+    times: dict[str, list[str]] = {}
+    for record in map(json.loads, log.splitlines()):
+        if record["archive"] is not None and record["archive"].startswith("demo/"):
+            times.setdefault(record["archive"], []).append(record["time"])
+    return [(min(one), max(one)) for one in times.values()]
 
 
 @pytest.mark.cluster
