@@ -12,6 +12,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numba import njit
 
 from . import noise
 from .extraction import REFINED, extract, response_to_tilt
@@ -206,20 +207,25 @@ def _units(blocks: Iterable[NDArray[Any]], size: int) -> Iterator[list[NDArray[A
         yield waiting
 
 
-def _displacement(slopes: Floats) -> Floats:
+@njit(cache=True, nogil=True)
+def _displacement(slopes: Any) -> Any:
     """Median over the spots of each source of their mean displacement, (2, S); NaN where half of them are not seen."""
-    if not len(slopes):
-        return np.full(slopes.shape[1:3], np.nan)
-    # The sum of a spot is finite exactly when no slope of it is missing: cheaper than looking at each.
-    mean = slopes.sum(axis=0) / len(slopes)
-    if np.isfinite(mean).all():
-        return np.asarray(np.median(mean, axis=-1))
-    seen = np.isfinite(slopes)
-    count = seen.sum(axis=0)
-    mean = np.where(seen, slopes, 0.0).sum(axis=0) / np.maximum(count, 1)
-    often = count >= 0.5 * len(slopes)
-    result = np.full(mean.shape[:2], np.nan)
-    for place in np.ndindex(*result.shape):
-        if often[place].mean() >= LIT:
-            result[place] = np.median(mean[place][often[place]])
+    n_frames, n_axes, n_sources, n_boxes = slopes.shape
+    result = np.full((n_axes, n_sources), np.nan)
+    mean = np.empty(n_boxes)
+    for axis in range(n_axes):
+        for source in range(n_sources):
+            often = 0
+            for box in range(n_boxes):
+                total, count = 0.0, 0
+                for frame in range(n_frames):
+                    slope = slopes[frame, axis, source, box]
+                    if np.isfinite(slope):
+                        total += slope
+                        count += 1
+                if count and count >= 0.5 * n_frames:
+                    mean[often] = total / count
+                    often += 1
+            if often and often >= LIT * n_boxes:
+                result[axis, source] = np.median(mean[:often])
     return result
