@@ -49,9 +49,9 @@ if TYPE_CHECKING:
 
 #: Raise it whenever the same input gives other numbers.
 MEASURE_VERSION = extraction.VERSION
-REDUCE_VERSION = 4
+REDUCE_VERSION = 5
 RESPONSE_VERSION = 2
-RETRIEVE_VERSION = 7
+RETRIEVE_VERSION = 8
 
 #: Fewer frames than this make no correlation worth the name.
 MIN_FRAMES = 64
@@ -70,7 +70,8 @@ class ReducedBatch:
     quality_flag : int
         Bits of :data:`coslidar.pipeline.products.QUALITY_FLAGS` known so far.
     arrays : dict of str to ndarray
-        `maps` (6, 2p - 1, 2q - 1), `noise_covariance` (m, m), `n_effective` (3,), `mean_flux` (S,),
+        `maps` (6, 2p - 1, 2q - 1), `noise_covariance` (m, m), `weighting_correction` (m,) of a fit weighted with it,
+        `n_effective` (3,), `mean_flux` (S,),
         `scintillation_index` (S,), `valid_fraction` (S,), `n_frames`, and checks under their names in
         :data:`coslidar.pipeline.products.SCHEMA`.
     """
@@ -183,10 +184,11 @@ def reduce(
     found = correlation.finalise(correlation.accumulate(slopes, flux), geometry)
     if parameters.covariance == "lagged":
         lagged = convergence.lagged(slopes, flux, geometry)
-        covariance, n_effective = lagged.covariance, lagged.n_effective
+        covariance, n_effective, correction = lagged
     else:
         covariance = convergence.independent(found.covariance, frames, geometry, found.valid_fraction)
         n_effective = np.full(3, float(frames))
+        correction = np.zeros(len(covariance))
     detection = _mean(measurements.flux_noise / found.mean_flux**2)
 
     tilt = timing.pupil_mean(slopes)
@@ -240,6 +242,7 @@ def reduce(
         arrays={
             "maps": maps,
             "noise_covariance": covariance,
+            "weighting_correction": correction,
             "n_effective": n_effective,
             "mean_flux": _mean(found.mean_flux),
             "scintillation_index": index,
@@ -351,6 +354,7 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
     shape = (len(MAP_KINDS), *geometry.map_shape)
     fitted = profile.model.reshape(shape)
     deviation = convergence.deviation_maps(arrays["noise_covariance"], geometry)
+    correction = convergence.on_maps(arrays["weighting_correction"], geometry)
     slope = [MAP_KINDS.index(kind) for kind in SLOPE_KINDS]
     intensity = [MAP_KINDS.index(kind) for kind in INTENSITY_KINDS]
     unknown = dict(zip(profile.nuisance_names, zip(profile.nuisance, profile.nuisance_error, strict=True), strict=True))
@@ -401,9 +405,11 @@ def retrieve(reduced: ReducedBatch, model: Model, neighbours: Sequence[ReducedBa
         "slope_correlation": arrays["maps"][slope],
         "slope_correlation_model": fitted[slope],
         "slope_correlation_error": deviation[slope],
+        "slope_correlation_correction": correction[slope],
         "intensity_correlation": arrays["maps"][intensity],
         "intensity_correlation_model": fitted[intensity],
         "intensity_correlation_error": deviation[intensity],
+        "intensity_correlation_correction": correction[intensity],
         "r0_profile": fried(profile.cn2),
         "r0_interval_68": interval(fried),
         "scintillation_index_direct": arrays["scintillation_index"],
@@ -470,7 +476,8 @@ def _known(reduced: ReducedBatch, model: Model) -> tuple[NDArray[np.float64], ND
         maps = maps.copy()
         centre = (maps.shape[1] // 2, maps.shape[2] // 2)
         maps[(MAP_KINDS.index("ii_auto"), *centre)] -= reduced.arrays["noise_variance_intensity_detector"].mean()
-    return correlation.data_vector(maps), model.regulariser.precision(model.grid)
+    correction = convergence.on_maps(reduced.arrays["weighting_correction"], model.geometry)
+    return correlation.data_vector(maps + correction), model.regulariser.precision(model.grid)
 
 
 def _whitened(reduced: ReducedBatch, model: Model) -> inversion.Reduction:

@@ -27,14 +27,23 @@ H = S^1/2 A S^1/2 the first term is the Gram matrix of the H, the second its pro
 the range of S^, whose dimension is at most n. The estimate therefore never has to be given up for the sake of
 positivity.
 
+Turbulence being the same all over the pupil, the cross-spectrum of two subapertures depends on their separation only;
+the average over all pairs with one separation has far less noise. It need not be positive; its negative eigenvalues are
+cut off and the rest shrunk to the same power, which leaves the covariance too large in those directions in which the
+maps hardly vary at all (chi2 about 0.8). So the average is taken for short records only, where the noise of the
+estimate is the greater evil.
+
 The error of S^ also correlates with the maps themselves: where the record happened to fluctuate strongly, maps and
-predicted noise are both large, and a fit weighted with the inverse of that noise comes out low (the scintillation
-index of a 20 s record by some 4 %), with a chi2 that is too large (1.4 per datum). Both faults go with the inverse of
-the record's length. Turbulence being the same all over the pupil, the cross-spectrum of two subapertures depends on
-their separation only; the average over all pairs with one separation has far less noise, and halves the bias. It need
-not be positive; its negative eigenvalues are cut off and the rest shrunk to the same power, which leaves the
-covariance too large in those directions in which the maps hardly vary at all (chi2 about 0.8). So the average is taken
-for short records only, where the noise of the estimate is the greater evil.
+predicted noise are both large, and a fit weighted with the inverse of that noise comes out low (Cn2 near the pupil by
+4 %, r0 by 2 % in records of 20 s; both go with the inverse of the record's length). No part of the data should be
+weighted with a covariance made of itself. The even and the odd ordinates of each band, which are independent, give two
+estimates Y_0, Y_1 of the maps y and two covariances C_0, C_1, all scaled to the whole record, and the weighted sums of
+a fit should take Y_0 with the inverse of C_1 and Y_1 with that of C_0. To first order in the differences of the halves
+
+    (C_1^-1 Y_0 + C_0^-1 Y_1) / 2 = C^-1 (y + d),    d = (C_0 - C_1) C^-1 (Y_0 - Y_1) / 4,        (3)
+
+so a fit of y + d with the covariance C of the whole record is free of the bias. It is cross-fitting as known for
+nuisance estimates of any kind (Chernozhukov et al. 2018, DOI 10.1111/ectj.12097).
 
 The products tr(A_p S A_q S) of all p and q are correlations over pairs of subapertures: with a = b + p and
 c = d + q running over the pupil, sum_{b,d} S_ac S_bd* + S_ad S_bc* is a four-dimensional correlation of S with
@@ -74,10 +83,14 @@ class LaggedConvergence(NamedTuple):
     n_effective : ndarray, (3,)
         For x slopes, y slopes and intensity: the number of independent frames over which the variance (the zero
         separation of the auto map) would have converged as well.
+    correction : ndarray, (m,)
+        What a fit weighted with `covariance` has to add to the rows `geometry.independent` of the data, Eq. (3) of
+        this module, so that no datum is weighted with a covariance made of itself; 0 in rows without data.
     """
 
     covariance: NDArray[np.float64]
     n_effective: NDArray[np.float64]
+    correction: NDArray[np.float64]
 
 
 def independent(
@@ -128,7 +141,7 @@ def independent(
     scale = _root_mean_square(power, present)
     weighted /= np.outer(_each_channel(scale, shape), _each_channel(scale, shape))
     products = _trace_products(_positive_part(weighted)[None], np.ones((1, 3, 3)), geometry)
-    return _assemble(2 / n_frames * products, scale, present, geometry)
+    return _assemble(2 / n_frames * products, *_pairs(scale, present, geometry))
 
 
 def lagged(
@@ -194,7 +207,8 @@ def lagged(
 
     size = deviation.shape[1]
     count = np.diff(edges).astype(np.float64)
-    spectra = np.empty((count.size, size, size), np.complex128)
+    halves = np.empty((2, count.size, size, size), np.complex128)
+    counts = np.empty((2, count.size))
     weights = np.empty((count.size, 3, 3))
     amplitude = np.sqrt(curve).astype(np.float32)
     powers = np.empty((count.size, 3))
@@ -203,27 +217,40 @@ def lagged(
         # can be averaged; the curves come back, squared, in the weight of the band.
         flat = spectrum[start:stop].reshape(-1, 3, size // 3) / amplitude[start:stop, :, None]
         flat = flat.reshape(-1, size)
-        spectra[band] = flat.T @ flat.conj()
-        spectra[band] /= length * count[band]
+        for half in range(2):
+            part = flat[half::2]
+            counts[half, band] = len(part)
+            halves[half, band] = part.T @ part.conj()
+            halves[half, band] /= length * len(part)
         weights[band] = curve[start:stop].T @ curve[start:stop]
         powers[band] = curve[start:stop].sum(axis=0)
-    unbiased = (count**2 / (count**2 - 1))[:, None, None] * weights
-    products = _trace_products(spectra, unbiased, geometry)
-    products -= _squared_traces(spectra, unbiased / count[:, None, None], geometry)
-    # The maps average all frames, whatever the number of them that measured the spectrum.
-    norm = 4 / (frames * length)
-    products *= norm
-
-    centre = np.searchsorted(geometry.independent, _centre_rows(geometry))
-    alone = _instantaneous_square(spectra, powers, geometry) * (2 / length) ** 2
-    power = np.diagonal(products)[centre]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        n_effective = np.where(power > 0, 2 * alone / power, np.nan)
+    share = (counts / count)[:, :, None, None]
+    spectra = share[0] * halves[0] + share[1] * halves[1]
+    n_effective = _effective(spectra, count, weights, powers, geometry) * (frames / length)
     if homogeneous is None:
         homogeneous = not n_effective[2] >= HOMOGENEOUS_BELOW
+    # One set of spectra for the whole, and the difference of two for the halves.
+    both, signed = halves.reshape(-1, size, size), np.concatenate([weights, -weights])
     if homogeneous:
-        products = norm * _trace_products(_homogeneous(spectra, present, geometry), weights, geometry)
-    return LaggedConvergence(_assemble(products, scale, present, geometry), n_effective)
+        products = _trace_products(_positive(_averaged(spectra, present, geometry)), weights, geometry)
+        unlike = _trace_products(_positive(_averaged(both, present, geometry)).astype(np.complex64), signed, geometry)
+    else:
+        products = _unbiased_products(spectra, count, weights, geometry)
+        unlike = _unbiased_products(both.astype(np.complex64), counts.ravel(), signed, geometry)
+    # The maps average all frames, whatever the number of them that measured the spectrum.
+    norm = 4 / (frames * length)
+    pairs, unit = _pairs(scale, present, geometry)
+    covariance = _assemble(norm * products, pairs, unit)
+    rows = np.flatnonzero(np.isfinite(np.diagonal(covariance)))
+    per_pair = unit[rows] / pairs[rows]
+    apart = _sums(halves[0] - halves[1], powers, geometry)[rows] * 2 / length
+    deviation = np.sqrt(np.diagonal(covariance)[rows])
+    inverse = linalg.solve(
+        covariance[np.ix_(rows, rows)] / np.outer(deviation, deviation), apart * per_pair / deviation, assume_a="pos"
+    )
+    correction = np.zeros(len(covariance))
+    correction[rows] = norm * per_pair * (unlike[np.ix_(rows, rows)] @ (per_pair * inverse / deviation)) / 4
+    return LaggedConvergence(covariance, n_effective, correction)
 
 
 def expand(matrix: NDArray[np.float64], geometry: Geometry) -> NDArray[np.float64]:
@@ -247,7 +274,7 @@ def expand(matrix: NDArray[np.float64], geometry: Geometry) -> NDArray[np.float6
     ValueError
         The matrix does not have the rows `geometry.independent`.
     """
-    rows, known = _independent_row(matrix, geometry)
+    rows, known = _independent_row(matrix.shape, geometry)
     return np.where(known[:, None] & known[None, :], matrix[np.ix_(rows, rows)], np.nan)
 
 
@@ -271,28 +298,43 @@ def deviation_maps(matrix: NDArray[np.float64], geometry: Geometry) -> NDArray[n
     ValueError
         The matrix does not have the rows `geometry.independent`.
     """
-    rows, known = _independent_row(matrix, geometry)
-    deviation = np.sqrt(np.diagonal(matrix))[rows]
-    return np.where(known, deviation, np.nan).reshape(len(MAP_KINDS), *geometry.map_shape)
+    return on_maps(np.sqrt(np.diagonal(matrix)), geometry)
 
 
-def _independent_row(matrix: NDArray[np.float64], geometry: Geometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def on_maps(values: NDArray[np.float64], geometry: Geometry) -> NDArray[np.float64]:
+    """Values of the independent data on the maps, where an auto map has each twice.
+
+    Parameters
+    ----------
+    values : ndarray, (m,)
+        One for each of the rows `geometry.independent`.
+    geometry : Geometry
+        Pupil and sources.
+
+    Returns
+    -------
+    ndarray, (6, 2p - 1, 2q - 1)
+        NaN where no pair is measured.
+
+    Raises
+    ------
+    ValueError
+        There is not one value for each of the rows `geometry.independent`.
+    """
+    rows, known = _independent_row(values.shape, geometry)
+    return np.where(known, values[rows], np.nan).reshape(len(MAP_KINDS), *geometry.map_shape)
+
+
+def _independent_row(shape: tuple[int, ...], geometry: Geometry) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Row of the independent data that each row of the data vector repeats, and whether there is one."""
     kept = geometry.independent
-    if matrix.shape != (kept.size, kept.size):
-        raise ValueError(
-            f"the matrix must be ({kept.size}, {kept.size}), one row for each independent datum: got {matrix.shape}"
-        )
+    wanted = (kept.size,) * len(shape)
+    if shape != wanted:
+        raise ValueError(f"the shape must be {wanted}, one row for each independent datum: got {shape}")
     position = np.full(geometry.valid.size, -1)
     position[kept] = np.arange(kept.size)
     rows = position[geometry.mirror]
     return np.maximum(rows, 0), rows >= 0
-
-
-def _centre_rows(geometry: Geometry) -> NDArray[np.int64]:
-    """Rows of the data vector with the zero separation of the auto maps of x, y and i, (3,)."""
-    entries = geometry.map_shape[0] * geometry.map_shape[1]
-    return np.asarray(AUTO_MAP) * entries + entries // 2
 
 
 def _each_channel(value: NDArray[np.float64], shape: tuple[int, int, int]) -> NDArray[np.float64]:
@@ -346,14 +388,13 @@ def _deviations(
     return series, present, scale
 
 
-def _homogeneous(
+def _averaged(
     spectra: NDArray[np.complex128], present: NDArray[np.float64], geometry: Geometry
 ) -> NDArray[np.complex128]:
-    """Cross-spectra averaged over all pairs of subapertures with the same separation, and made positive.
+    """Cross-spectra averaged over all pairs of subapertures with the same separation.
 
     Turbulence is the same all over the pupil, so the cross-spectrum of two subapertures depends on their separation
-    alone. The average over the pairs takes away most of the noise of the estimate, but need not be positive; its
-    negative eigenvalues, which are noise, are cut off and the others shrunk so that the power stays what it was.
+    alone. The average over the pairs takes away most of the noise of the estimate.
 
     Parameters
     ----------
@@ -378,10 +419,31 @@ def _homogeneous(
     blocks = blocks.reshape(bands, groups, groups, -1) * pairs
     mean = ((blocks @ belongs) / count)[..., entry] * pairs
     mean = mean.reshape(bands, groups, groups, subapertures, subapertures).transpose(0, 1, 3, 2, 4)
-    values, vectors = np.linalg.eigh(mean.reshape(bands, size, size))
+    return np.asarray(mean.reshape(bands, size, size))
+
+
+def _positive(spectra: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Averages without their negative eigenvalues, which are noise, the others shrunk to the power that was there.
+
+    Parameters
+    ----------
+    spectra : ndarray, (B, n, n)
+        Hermitian matrices.
+    """
+    values, vectors = np.linalg.eigh(spectra)
     kept = np.maximum(values, 0.0)
     kept *= (values.sum(axis=1) / np.maximum(kept.sum(axis=1), np.finfo(float).tiny))[:, None]
     return np.asarray((vectors * kept[:, None, :]) @ vectors.conj().swapaxes(1, 2))
+
+
+def _unbiased_products(
+    spectra: NDArray[np.complex128], count: NDArray[np.float64], weights: NDArray[np.float64], geometry: Geometry
+) -> NDArray[np.float64]:
+    """Weighted sum of tr(A_p S A_q S), S being known from `count` ordinates only; as `_trace_products`."""
+    weights = (count**2 / (count**2 - 1))[:, None, None] * weights
+    products = _trace_products(spectra, weights, geometry)
+    products -= _squared_traces(spectra, weights / count[:, None, None], geometry)
+    return products
 
 
 def _band_edges(ordinates: int, bands: int) -> NDArray[np.int64]:
@@ -424,10 +486,45 @@ def _power_curve(spectrum: NDArray[np.complexfloating], edges: NDArray[np.int64]
     return np.exp(np.stack([np.interp(place, centre, level[:, kind]) for kind in range(3)], axis=1))
 
 
-def _instantaneous_square(
-    spectra: NDArray[np.complex128], powers: NDArray[np.float64], geometry: Geometry
+def _effective(
+    spectra: NDArray[np.complex128],
+    count: NDArray[np.float64],
+    weights: NDArray[np.float64],
+    powers: NDArray[np.float64],
+    geometry: Geometry,
 ) -> NDArray[np.float64]:
-    """tr(A S A S) of the zero separation of each auto map, S summed over all ordinates (positive ones), (3,).
+    """Independent frames over which the zero separation of each auto map would have converged as well, (3,).
+
+    The operator of that separation is the identity of its kind, so both traces of Eqs. (1) and (2) are sums of squares.
+
+    Parameters
+    ----------
+    spectra : ndarray, (B, 3 S A, 3 S A)
+        Cross-spectra of the flattened ordinates.
+    count : ndarray, (B,)
+        Ordinates of each band.
+    weights : ndarray, (B, 3, 3)
+        Sum over the ordinates of a band of the products of the curves that flattened them.
+    powers : ndarray, (B, 3)
+        Sum over the ordinates of a band of the curves.
+    geometry : Geometry
+        Pupil and sources.
+    """
+    block = geometry.n_sources * geometry.n_subapertures
+    found = np.full(3, np.nan)
+    for kind in range(3):
+        part = spectra[:, kind * block : (kind + 1) * block, kind * block : (kind + 1) * block]
+        alone = np.sum(np.tensordot(powers[:, kind], part.real, 1) ** 2)
+        trace = np.trace(part, axis1=1, axis2=2).real
+        square = np.sum(part.real**2 + part.imag**2, axis=(1, 2)) - trace**2 / count
+        together = np.sum(count**2 / (count**2 - 1) * weights[:, kind, kind] * square)
+        if together > 0:
+            found[kind] = 2 * alone / together
+    return found
+
+
+def _sums(spectra: NDArray[np.complex128], powers: NDArray[np.float64], geometry: Geometry) -> NDArray[np.float64]:
+    """Sums over the pairs of each separation, and over the ordinates of positive frequency, (m,).
 
     Parameters
     ----------
@@ -438,12 +535,18 @@ def _instantaneous_square(
     geometry : Geometry
         Pupil and sources.
     """
-    block = geometry.n_sources * geometry.n_subapertures
-    total = np.empty(3)
+    sources, subapertures = geometry.n_sources, geometry.n_subapertures
+    entry = pair_entry(geometry).ravel()
+    entries = geometry.map_shape[0] * geometry.map_shape[1]
+    blocks = spectra.real.reshape(-1, 3, sources, subapertures, 3, sources, subapertures)
+    sums = np.zeros((len(MAP_KINDS), entries))
     for kind in range(3):
-        part = slice(kind * block, (kind + 1) * block)
-        total[kind] = np.sum(np.tensordot(powers[:, kind], spectra[:, part, part].real, 1) ** 2)
-    return total
+        total = np.tensordot(powers[:, kind], blocks[:, kind, :, :, kind], 1)
+        for source in range(sources):
+            sums[AUTO_MAP[kind]] += np.bincount(entry, total[source, :, source].ravel(), entries)
+        if sources == 2:
+            sums[CROSS_MAP[kind]] = np.bincount(entry, total[0, :, 1].ravel(), entries)
+    return np.asarray(sums.ravel()[geometry.independent])
 
 
 def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -471,7 +574,7 @@ def _trace_products(
     spectra : ndarray, (B, 3 S A, 3 S A)
         Hermitian (or real symmetric) matrices S.
     weights : ndarray, (B, 3, 3)
-        Weight of each matrix for a p of one kind of signal and a q of another.
+        Weight, of either sign, of each matrix for a p of one kind of signal and a q of another.
     geometry : Geometry
         Pupil and sources.
 
@@ -482,10 +585,11 @@ def _trace_products(
     """
     sources, subapertures = geometry.n_sources, geometry.n_subapertures
     rows, columns = geometry.map_shape
+    precision = np.result_type(spectra, np.complex64)
     i, j = geometry.subaperture_index.T
     u, v = np.divmod(np.arange(rows * columns), columns)
     # Transform over the pupil, padded to the size of a map so that no correlation wraps around.
-    pupil = np.exp(-2j * np.pi * (np.outer(u, i) / rows + np.outer(v, j) / columns))
+    pupil = np.exp(-2j * np.pi * (np.outer(u, i) / rows + np.outer(v, j) / columns)).astype(precision)
     blocks = spectra.reshape(-1, 3, sources, subapertures, 3, sources, subapertures)
     kept = _map_rows(geometry)
     starts = np.concatenate([[0], np.cumsum([entry.size for entry in kept])])
@@ -509,12 +613,12 @@ def _trace_products(
             power = np.zeros((pupil.shape[0],) * 2)
             swapped, upper, straight, crossed = np.zeros((4, *power.shape), np.complex128)
             # One spectrum at a time stays in the processor's cache, and small for instruments with many lenslets.
-            for matrix, weight in zip(blocks, np.sqrt(weights[:, one, other]), strict=True):
-                block = matrix[one, :, :, other].transpose(0, 2, 1, 3) * weight  # source, source, a, c
-                transform = pupil @ block.astype(np.complex128) @ pupil.T
-                power += np.sum(transform.real**2 + transform.imag**2, axis=(0, 1))
+            for matrix, weight in zip(blocks, weights[:, one, other], strict=True):
+                block = matrix[one, :, :, other].transpose(0, 2, 1, 3)  # source, source, a, c
+                transform = pupil @ block.astype(precision) @ pupil.T
+                conjugate = weight * transform.conj()
+                power += np.sum((transform * conjugate).real, axis=(0, 1))
                 if sources == 2:
-                    conjugate = transform.conj()
                     swapped += transform[0, 1] * conjugate[0, 0] + transform[1, 1] * conjugate[1, 0]
                     upper += transform[0, 0] * conjugate[1, 0] + transform[0, 1] * conjugate[1, 1]
                     straight += transform[0, 0] * conjugate[1, 1]
@@ -560,17 +664,15 @@ def _squared_traces(
     )
 
 
-def _assemble(
-    products: NDArray[np.float64], scale: NDArray[np.float64], present: NDArray[np.float64], geometry: Geometry
-) -> NDArray[np.float64]:
-    """Covariance of the map averages in their units from that of the sums over pairs.
+def _pairs(
+    scale: NDArray[np.float64], present: NDArray[np.float64], geometry: Geometry
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Number of pairs that each of the rows `geometry.independent` averages, gaps taken off, and its unit.
 
     Parameters
     ----------
-    products : ndarray, (m, m)
-        Covariance of sums over pairs of the signals in units of `scale`, gaps counting zero.
     scale : ndarray, (3,)
-        Unit of each kind.
+        Unit of each kind of signal.
     present : ndarray, (3, S, A)
         Part of the frames in which each channel is measured.
     geometry : Geometry
@@ -578,7 +680,7 @@ def _assemble(
 
     Returns
     -------
-    ndarray, (m, m)
+    pairs, unit : ndarray, (m,)
     """
     entry = pair_entry(geometry).ravel()
     entries = geometry.map_shape[0] * geometry.map_shape[1]
@@ -595,10 +697,27 @@ def _assemble(
         if geometry.n_sources == 2:
             pairs[CROSS_MAP[kind]] = weight(kind, 0, 1)
     kept = geometry.independent
-    count = pairs.ravel()[kept]
-    unit = unit[kept // entries]
+    return pairs.ravel()[kept], unit[kept // entries]
 
-    rows = np.flatnonzero((count > 0) & (np.diagonal(products) > 0))
+
+def _assemble(
+    products: NDArray[np.float64], pairs: NDArray[np.float64], unit: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Covariance of the map averages in their units from that of the sums over pairs.
+
+    Parameters
+    ----------
+    products : ndarray, (m, m)
+        Covariance of sums over pairs of the signals in units of `scale`, gaps counting zero.
+    pairs, unit : ndarray, (m,)
+        Of :func:`_pairs`.
+
+    Returns
+    -------
+    ndarray, (m, m)
+        NaN in rows without a pair.
+    """
+    rows = np.flatnonzero((pairs > 0) & (np.diagonal(products) > 0))
     deviation = np.sqrt(np.diagonal(products)[rows])
     correlation = products[np.ix_(rows, rows)] / np.outer(deviation, deviation)
     correlation = (correlation + correlation.T) / 2
@@ -608,7 +727,7 @@ def _assemble(
         values, vectors = linalg.eigh(correlation)
         correlation = (vectors * np.maximum(values, _FLOOR)) @ vectors.T
         correlation = (correlation + correlation.T) / 2
-    error = deviation * unit[rows] / count[rows]
-    covariance = np.full((kept.size, kept.size), np.nan)
+    error = deviation * unit[rows] / pairs[rows]
+    covariance = np.full(products.shape, np.nan)
     covariance[np.ix_(rows, rows)] = correlation * np.outer(error, error)
     return covariance

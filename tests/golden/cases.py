@@ -290,8 +290,11 @@ def reduce() -> Arrays:
     found = batch.reduce(measurements(), GEOMETRY, RATE, 4.0, CorrelationParameters())
     independent = batch.reduce(measurements(), GEOMETRY, RATE, 4.0, CorrelationParameters(covariance="independent"))
     rest = {name: value for name, value in found.arrays.items() if name not in ("maps", "noise_covariance")}
+    # Of 4 s, with a covariance so badly known that rounding shows: its size, in standard deviations.
+    own = rest.pop("weighting_correction") / np.sqrt(np.diagonal(found.arrays["noise_covariance"]))
     return {
         **rest,
+        "weighting_correction_size": np.asarray(np.sqrt(np.nanmean(own**2))),
         **by_kind("maps", found.arrays["maps"]),
         **covariance("noise", found.arrays["noise_covariance"]),
         **covariance("noise_independent", independent.arrays["noise_covariance"]),
@@ -328,6 +331,7 @@ def retrieve() -> Arrays:
         arrays={
             "maps": noisy,
             "noise_covariance": np.diag((0.04 * size) ** 2),
+            "weighting_correction": np.zeros(len(size)),
             "n_effective": np.full(3, 200.0),
             "mean_flux": np.full(2, 9000.0),
             "scintillation_index": np.full(2, 0.02),

@@ -143,6 +143,7 @@ def reduced(maps: np.ndarray) -> batch.ReducedBatch:
         arrays={
             "maps": maps.reshape(6, 3, 3),
             "noise_covariance": np.diag((0.01 * size) ** 2),
+            "weighting_correction": np.zeros(len(size)),
             "n_effective": np.full(3, 1000.0),
             "mean_flux": np.full(2, 1e4),
             "scintillation_index": np.full(2, 0.02),

@@ -41,6 +41,7 @@ def reduced(maps: np.ndarray, flux_variance: float = 0.0) -> batch.ReducedBatch:
         arrays={
             "maps": maps.reshape(6, 9, 9),
             "noise_covariance": np.diag((0.05 * size) ** 2),
+            "weighting_correction": np.zeros(len(size)),
             "n_effective": np.full(3, 1000.0),
             "mean_flux": np.full(2, 1e4),
             "scintillation_index": np.full(2, 0.02),
