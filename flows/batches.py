@@ -97,7 +97,7 @@ class Batches:
         for window in self.plan.windows:
             result = self._unkept.get(window.index) or scratch.load(self.plan.result_key(window))
             if result is None:
-                raise RuntimeError(f"the kept result of batch {window.index} is gone; run again")
+                raise RuntimeError(f"the kept result of batch {window.index} cannot be read back; run again")
             found.append(result)
         return found
 
