@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from coslidar.pipeline.shifts import Splines, cubic_taps
 from scipy import ndimage
 from scipy.interpolate import BSpline
+
+from coslidar.pipeline.shifts import Splines, cubic_taps
 
 
 def test_taps_are_the_cubic_spline():
