@@ -98,8 +98,8 @@ def _profiles(axes: Axes, outcome: Outcome, grid: SliceGrid) -> None:
     )  # fmt: skip
     axes.plot(grid.centres, mean, "o", color=BLUE, ms=4, label="mean of all draws")
     axes.set_title("profiles")
-    axes.set_ylabel("Cn2 [m^(-2/3)]")
-    axes.set_xlabel("z [m]")
+    axes.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
+    axes.set_xlabel("z (m)")
     axes.legend(fontsize=9)
 
 
@@ -111,6 +111,6 @@ def _coverage(axes: Axes, outcome: Outcome, grid: SliceGrid) -> None:
             style = "-" if level == 0 else "--"
             axes.plot(grid.centres, values, style, marker=".", color=colour, label=f"{kind} {nominal:.0%}")
     axes.set_title("share of draws that hold the truth")
-    axes.set_xlabel("z [m]")
+    axes.set_xlabel("z (m)")
     axes.set_ylim(0, 1.02)
     axes.legend(fontsize=9, ncols=2)

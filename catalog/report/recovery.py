@@ -88,16 +88,18 @@ def draw_recovery(found: Found, title: str, path: Path) -> None:
             )
         left.stairs(found.truth.mean(axis=0), edges, color=INK, lw=2.0, baseline=None, label="truth")
         left.plot(z, found.cn2.mean(axis=0), "o", color=RED, label="mean profile")
-        left.set_xlabel("z [m]")
-        left.set_ylabel("Cn2 [m^(-2/3)]")
-        left.set_ylim(bottom=0)
+        left.set_xlabel("z (m)")
+        left.set_ylabel(r"$C_n^2$ (m$^{-2/3}$)")
+        # A single recording may be far off in the last slice; the scale is that of what is stated.
+        stated = found.mean_interval_95[np.isfinite(found.mean_interval_95)]
+        left.set_ylim(0, 1.25 * max(stated.max(initial=0.0), found.truth.max()))
         left.set_title(title)
         left.legend(fontsize=9)
         for values, nominal, style in ((found.held_68, 0.68, "-o"), (found.held_95, 0.95, "--s")):
             right.axhline(nominal, color=MUTED, lw=0.9, ls=":")
             right.plot(z, values, style, color=BLUE, label=f"{nominal:.0%} interval")
         right.set_ylim(0, 1.02)
-        right.set_xlabel("z [m]")
+        right.set_xlabel("z (m)")
         right.set_title("share of recordings that hold the truth")
         right.legend(loc="lower left")
         figure.savefig(path, metadata={"Date": None} if path.suffix.lower() == ".svg" else None)
