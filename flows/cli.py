@@ -6,6 +6,7 @@ import importlib
 import os
 import signal
 import sys
+import threading
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
@@ -82,7 +83,12 @@ def complain(faults: Sequence[str]) -> None:
         click.echo(f"coslidar: {fault}", err=True)
 
 
+#: Set once a signal has asked this process to end.
+interrupted = threading.Event()
+
+
 def _stop(signum: int, frame: Any) -> NoReturn:
+    interrupted.set()
     # Once is a request, twice an order.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(130))

@@ -211,6 +211,7 @@ def run(
     from contextlib import ExitStack
 
     from .. import logs
+    from ..cli import interrupted
     from ..progress import say
     from ..server import server
 
@@ -226,11 +227,14 @@ def run(
         if len(campaigns) > 1 and not no_prefect:
             around.enter_context(server())()
         for settings in campaigns:
-            if worst and not keep_going:
+            if interrupted.is_set() or (worst and not keep_going):
                 break
             if len(campaigns) > 1 and not (quiet or logged):
                 say(settings.origin)
             worst = max(worst, _run_one(settings, options, not no_prefect, quiet, logged))
+    if interrupted.is_set():
+        # Prefect can lose the exception of a signal while it makes a flow run, and end as if nothing had been.
+        raise KeyboardInterrupt
     raise click.exceptions.Exit(worst)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -146,3 +147,25 @@ def test_interrupt_before_anything_began(started: Start, recordings: list[str], 
     assert process.returncode == 130, err
     assert "Traceback" not in err
     assert err.count("\n") <= 1 + err.count("published")
+
+
+def test_an_interrupt_that_a_library_swallows_ends_the_run_all_the_same(tmp_path: Path) -> None:
+    code = """
+import os, signal, sys
+from coslidar.flows import cli
+from coslidar.flows.commands import process
+
+def swallowing(*arguments):
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        signal.pause()
+    except KeyboardInterrupt:
+        return 0
+
+process._run_one = swallowing
+sys.argv = ["coslidar", "run", "some.zarr", "--no-prefect"]
+cli.main()
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 130
+    assert "interrupted" in done.stderr
