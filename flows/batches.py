@@ -36,6 +36,10 @@ AHEAD = 2
 PATIENCE = 0.2
 
 
+class Vanished(RuntimeError):
+    """The kept result of a batch is gone: another run has published the same product, or the disk lost it."""
+
+
 class Batches:
     """The batches of one archive in one run.
 
@@ -92,12 +96,18 @@ class Batches:
                 self._take(outcome)
 
     def results(self) -> list[BatchResult]:
-        """All batches in their order, once they are computed."""
+        """All batches in their order, once they are computed.
+
+        Raises
+        ------
+        Vanished
+            A result is no longer where it was kept.
+        """
         scratch, found = self.work.catalog.scratch, []
         for window in self.plan.windows:
             result = self._unkept.get(window.index) or scratch.load(self.plan.result_key(window))
             if result is None:
-                raise RuntimeError(f"the kept result of batch {window.index} cannot be read back; run again")
+                raise Vanished(f"the kept result of batch {window.index} cannot be read back; run again")
             found.append(result)
         return found
 

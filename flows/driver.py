@@ -24,7 +24,7 @@ from ..pipeline import description, strong_scintillation, surroundings
 from ..pipeline.units import safe, text
 from ..plugins.registry import PluginError
 from . import logs
-from .batches import FAILED, PATIENCE, Batches, Workers
+from .batches import FAILED, PATIENCE, Batches, Vanished, Workers
 from .caches import cache_folder
 from .options import Options
 from .patience import patiently, unreachable
@@ -285,7 +285,7 @@ def _outcome(url: str, work: Work) -> ArchiveOutcome:
             return ArchiveOutcome(url, name, "skipped", note="outside the range of time")
         with logs.about(archive=name):
             # What was computed is kept, so another try goes on where the database was lost.
-            return patiently(lambda: _process(plan, work), passing)
+            return patiently(lambda: _process(plan, work), lambda error: passing(error) or isinstance(error, Vanished))
     except (ArchiveError, InputError, PluginError) as error:
         if unreachable(error):
             return ArchiveOutcome(url, name, "failed", faults=tuple(error.faults), transient=True)
