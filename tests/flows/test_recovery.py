@@ -39,7 +39,7 @@ def run(*arguments: str) -> str:
 
 
 def test_a_small_instrument_finds_its_truth(small: Path, tmp_path: Path) -> None:
-    """Three recordings of 20 s: the slice at the pupil and r0 have 5 % from the covariance of so short a record."""
+    """Three recordings of 20 s: the slice at the pupil and r0 are known to a few per cent in each."""
     figure = tmp_path / "new" / "small.svg"
     found = json.loads(run(str(small), "--records", "3", "--json", "-o", str(figure)))
     assert found["records"] == 3
@@ -105,11 +105,11 @@ def told(name: str, records: int) -> Recovery:
 @pytest.mark.parametrize(
     ("name", "records", "slices", "held_68", "held_95"),
     [
-        # docs/validation.md: 10 of 12 slices, 0.60, 0.86; 12, 0.69, 0.96; 9 of 10, 0.45, 0.79. A share of 12 slices of
+        # docs/validation.md: 10 of 12 slices, 0.63, 0.87; 12, 0.75, 0.97; 10 of 10, 0.50, 0.89. A share of 12 slices of
         # which some three are independent has an error of 0.04 for 50 recordings and of 0.06 for 20.
         ("lannemezan-strong", 50, 10, 0.52, 0.78),
-        ("lannemezan-weak", 20, 11, 0.55, 0.86),
-        ("six-by-six-strong", 12, 8, 0.30, 0.65),
+        ("lannemezan-weak", 20, 11, 0.60, 0.90),
+        ("six-by-six-strong", 12, 9, 0.35, 0.75),
     ],
 )
 def test_the_truth_lies_within_the_stated_intervals(
@@ -121,8 +121,8 @@ def test_the_truth_lies_within_the_stated_intervals(
     assert found.held_95.mean() >= held_95
     # Half a nominal 68 % would be bars that are far too wide.
     assert found.held_68.mean() < 0.85
-    # What is common to all recordings, near the pupil: 2 to 7 % from the covariance of so short records.
+    # Near the pupil nothing is common to all recordings; a slice of one scatters by up to 7 %.
     near = found.grid.centres < 0.25 * found.grid.edges[-1]
-    np.testing.assert_allclose(found.cn2.mean(axis=0)[near], found.truth.mean(axis=0)[near], rtol=0.10)
+    np.testing.assert_allclose(found.cn2.mean(axis=0)[near], found.truth.mean(axis=0)[near], rtol=0.05)
     r0 = found.integrals["r0"]
-    assert r0.found.mean() == pytest.approx(r0.truth.mean(), rel=0.05)
+    assert r0.found.mean() == pytest.approx(r0.truth.mean(), rel=0.02)
