@@ -59,7 +59,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
-from .correlation import AUTO_MAP, CROSS_MAP, channels, pair_entry
+from .correlation import AUTO_MAP, CROSS_MAP, SIGNAL_KINDS, channels, pair_entry
 from .geometry import MAP_KINDS, Geometry
 
 #: Fewest ordinates of a band. With two the bias could still be removed, but estimates from a few ordinates are so
@@ -68,6 +68,9 @@ _FEWEST_ORDINATES = 8
 
 #: Effectively independent frames of scintillation below which cross-spectra are averaged over equal separations.
 HOMOGENEOUS_BELOW = 1000
+
+#: Number of the kind of signal of each map.
+_SIGNAL = [SIGNAL_KINDS.index(kind[0]) for kind in MAP_KINDS]
 
 #: Smallest eigenvalue kept, relative to the variances. Only records of a few dozen frames come near it.
 _FLOOR = 1e-12
@@ -535,18 +538,8 @@ def _sums(spectra: NDArray[np.complex128], powers: NDArray[np.float64], geometry
     geometry : Geometry
         Pupil and sources.
     """
-    sources, subapertures = geometry.n_sources, geometry.n_subapertures
-    entry = pair_entry(geometry).ravel()
-    entries = geometry.map_shape[0] * geometry.map_shape[1]
-    blocks = spectra.real.reshape(-1, 3, sources, subapertures, 3, sources, subapertures)
-    sums = np.zeros((len(MAP_KINDS), entries))
-    for kind in range(3):
-        total = np.tensordot(powers[:, kind], blocks[:, kind, :, :, kind], 1)
-        for source in range(sources):
-            sums[AUTO_MAP[kind]] += np.bincount(entry, total[source, :, source].ravel(), entries)
-        if sources == 2:
-            sums[CROSS_MAP[kind]] = np.bincount(entry, total[0, :, 1].ravel(), entries)
-    return np.asarray(sums.ravel()[geometry.independent])
+    traces = _traces(spectra, geometry)
+    return np.concatenate([powers[:, kind] @ trace for kind, trace in zip(_SIGNAL, traces, strict=True)])
 
 
 def _positive_part(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -631,10 +624,16 @@ def _trace_products(
     return products
 
 
-def _squared_traces(
-    spectra: NDArray[np.complex128], weights: NDArray[np.float64], geometry: Geometry
-) -> NDArray[np.float64]:
-    """Weighted sum over spectra of tr(A_p S) tr(A_q S); arguments and result as in `_trace_products`."""
+def _traces(spectra: NDArray[np.number], geometry: Geometry) -> list[NDArray[np.float64]]:
+    """Trace of A_p S, the sum over the pairs of a separation, of each spectrum; for each map, (B, its rows).
+
+    Parameters
+    ----------
+    spectra : ndarray, (B, 3 S A, 3 S A)
+        Hermitian (or real symmetric) matrices S.
+    geometry : Geometry
+        Pupil and sources.
+    """
     sources, subapertures = geometry.n_sources, geometry.n_subapertures
     entries = geometry.map_shape[0] * geometry.map_shape[1]
     entry = pair_entry(geometry).ravel()
@@ -644,21 +643,27 @@ def _squared_traces(
     place = (entry[None, :] + entries * np.arange(bands)[:, None]).ravel()
     kept = _map_rows(geometry)
     traces = [np.zeros((bands, entry.size)) for entry in kept]
-    signal = np.empty(len(MAP_KINDS), np.int64)
 
     def trace(kind: int, first: int, second: int) -> NDArray[np.float64]:
         pairs = blocks[:, kind, first, :, kind, second, :].ravel()
         return np.asarray(np.bincount(place, pairs, entries * bands).reshape(bands, entries), np.float64)
 
     for kind in range(3):
-        signal[[AUTO_MAP[kind], CROSS_MAP[kind]]] = kind
         auto = np.sum([trace(kind, source, source) for source in range(sources)], axis=0)
         traces[AUTO_MAP[kind]] = auto[:, kept[AUTO_MAP[kind]]]
         if sources == 2:
             traces[CROSS_MAP[kind]] = trace(kind, 0, 1)[:, kept[CROSS_MAP[kind]]]
+    return traces
+
+
+def _squared_traces(
+    spectra: NDArray[np.complex128], weights: NDArray[np.float64], geometry: Geometry
+) -> NDArray[np.float64]:
+    """Weighted sum over spectra of tr(A_p S) tr(A_q S); arguments and result as in `_trace_products`."""
+    traces = _traces(spectra, geometry)
     return np.block(
         [
-            [(first * weights[:, signal[one], signal[other], None]).T @ second for other, second in enumerate(traces)]
+            [(first * weights[:, _SIGNAL[one], _SIGNAL[other], None]).T @ second for other, second in enumerate(traces)]
             for one, first in enumerate(traces)
         ]
     )
@@ -682,22 +687,9 @@ def _pairs(
     -------
     pairs, unit : ndarray, (m,)
     """
-    entry = pair_entry(geometry).ravel()
-    entries = geometry.map_shape[0] * geometry.map_shape[1]
-    pairs = np.zeros((len(MAP_KINDS), entries))
-    unit = np.empty(len(MAP_KINDS))
-
-    def weight(kind: int, first: int, second: int) -> NDArray[np.float64]:
-        both = np.outer(present[kind, first], present[kind, second])
-        return np.asarray(np.bincount(entry, both.ravel(), entries), np.float64)
-
-    for kind in range(3):
-        unit[[AUTO_MAP[kind], CROSS_MAP[kind]]] = scale[kind] ** 2
-        pairs[AUTO_MAP[kind]] = sum(weight(kind, source, source) for source in range(geometry.n_sources))
-        if geometry.n_sources == 2:
-            pairs[CROSS_MAP[kind]] = weight(kind, 0, 1)
-    kept = geometry.independent
-    return pairs.ravel()[kept], unit[kept // entries]
+    traces = _traces(np.outer(present, present)[None], geometry)
+    units = [np.full(trace.shape[1], scale[kind] ** 2) for kind, trace in zip(_SIGNAL, traces, strict=True)]
+    return np.concatenate([trace[0] for trace in traces]), np.concatenate(units)
 
 
 def _assemble(
